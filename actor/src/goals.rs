@@ -1,0 +1,99 @@
+//! Where a worker gets its goals from.
+
+use magex_proto::MAX_BATCH_BYTES;
+pub use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind, WeightsKey};
+use magex_proto::v1;
+use magex_proto::v1::commander_service_client::CommanderServiceClient;
+use magex_runtime::backoff::Backoff;
+use magex_runtime::status;
+use std::time::Duration;
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+
+/// A call that takes longer is made again. The commander itself waits up to 5 s for weights.
+const CALL_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Why there are no goals.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum GoalError {
+    /// Nobody wants the result any more.
+    #[error("no longer wanted")]
+    Cancelled,
+    /// The commander refused, and would refuse again.
+    #[error("the commander refused: {0}")]
+    Refused(String),
+    /// The answer makes no sense.
+    #[error("the commander's answer makes no sense: {0}")]
+    Answer(String),
+}
+
+/// Hands out the goals of a shard's episodes with the weights that the shard names. Blocks.
+pub trait GoalSource {
+    /// One goal per agent of every episode.
+    fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError>;
+}
+
+/// Asks the commander service, again and again while it is late or away: for as long as the result is wanted.
+#[derive(Debug)]
+pub struct GrpcGoals {
+    runtime: Handle,
+    client: CommanderServiceClient<Channel>,
+    weights: WeightsKey,
+    cancelled: CancellationToken,
+}
+
+impl GrpcGoals {
+    /// Asks these weights over this channel, until cancelled.
+    pub fn new(runtime: Handle, channel: Channel, weights: WeightsKey, cancelled: CancellationToken) -> Self {
+        let client = CommanderServiceClient::new(channel)
+            .max_decoding_message_size(MAX_BATCH_BYTES)
+            .max_encoding_message_size(MAX_BATCH_BYTES);
+        Self { runtime, client, weights, cancelled }
+    }
+}
+
+impl GoalSource for GrpcGoals {
+    fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError> {
+        let message = request.to_message(&self.weights);
+        let call = ask(&mut self.client, message);
+        let answer = self.runtime.block_on(self.cancelled.run_until_cancelled(call));
+        let answer = answer.ok_or(GoalError::Cancelled)??;
+        GoalReply::from_message(answer, request).map_err(|error| GoalError::Answer(error.to_string()))
+    }
+}
+
+async fn ask(
+    client: &mut CommanderServiceClient<Channel>,
+    message: v1::AssignBatchRequest,
+) -> Result<v1::AssignBatchResponse, GoalError> {
+    let mut backoff = Backoff::default();
+    let mut failures = 0u32;
+    loop {
+        let call = tokio::time::timeout(CALL_TIMEOUT, client.assign_batch(message.clone())).await;
+        let problem = match call {
+            Ok(Ok(response)) => {
+                if failures > 0 {
+                    tracing::info!(failures, "the commander answers again");
+                }
+                return Ok(response.into_inner());
+            }
+            Ok(Err(status)) if !is_transient(&status) => {
+                return Err(GoalError::Refused(format!("{}: {}", status.code(), status.message())));
+            }
+            Ok(Err(status)) => status.message().to_owned(),
+            Err(_) => "no answer in time".to_owned(),
+        };
+        failures += 1;
+        if failures == 1 {
+            tracing::warn!(problem, "the commander does not answer; trying again for as long as it takes");
+        }
+        tokio::time::sleep(backoff.next_wait()).await;
+    }
+}
+
+/// A commander that is being started may not know its own service yet; one of another size may answer the next call.
+fn is_transient(status: &Status) -> bool {
+    status::is_transient(status) || status.code() == Code::Unimplemented
+}

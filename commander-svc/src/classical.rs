@@ -1,0 +1,84 @@
+//! The schedulers that need no training.
+
+use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind, TeamReply, TeamRequest};
+use magex_assign::{Solver, UNASSIGNED, cost_of, distances, greedy, random::random};
+use magex_core::keys::episode_keys;
+use magex_core::rng::{Key, Purpose, Stream};
+
+impl From<magex_assign::AssignError> for AssignError {
+    fn from(error: magex_assign::AssignError) -> Self {
+        let text = error.to_string();
+        match text.split_once(": ") {
+            Some((field, problem)) => Self::invalid(field, problem),
+            None => Self::Failed(text),
+        }
+    }
+}
+
+/// A matching and what it costs.
+#[derive(Debug, Clone, PartialEq)]
+struct Answer {
+    goals: Vec<u32>,
+    cost: f64,
+    exact_cost: f64,
+}
+
+/// Answers for one team with distances `[rows, cols]`. Learned counts as exact: it is what stands in for it.
+fn answer(
+    kind: SchedulerKind,
+    solver: &mut Solver,
+    costs: &[f64],
+    (rows, cols): (usize, usize),
+    stream: impl FnOnce() -> Stream,
+) -> Result<Answer, AssignError> {
+    let exact = solver.solve(costs, rows, cols)?;
+    let exact_cost = exact.cost;
+    let goals = match kind {
+        SchedulerKind::Exact | SchedulerKind::Learned => exact.col_of_row,
+        SchedulerKind::Greedy => greedy(costs, rows, cols)?.col_of_row,
+        SchedulerKind::Random => random(rows, cols, &mut stream())?,
+    };
+    let cost = cost_of(costs, cols, &goals);
+    Ok(Answer { goals, cost, exact_cost })
+}
+
+/// Goals for the episodes of a shard.
+pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignError> {
+    let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
+    if g < n {
+        return Err(AssignError::invalid("goals", format!("{g} goals are not enough for {n} agents")));
+    }
+    if n == 0 || d == 0 {
+        return Err(AssignError::invalid("agents", format!("{n} agents in {d} dimensions make no team")));
+    }
+    let mut solver = Solver::default();
+    let mut reply = GoalReply { goals: Vec::new(), log_probs: Vec::new(), costs: Vec::new(), exact_costs: Vec::new() };
+    let episodes = request.agents.chunks_exact(n * d).zip(request.goals.chunks_exact(g * d));
+    for (b, (agents, goals)) in episodes.enumerate() {
+        let stream = || episode_keys(request.seed, &request.shard, b as u32).commander.stream();
+        let costs = distances(agents, goals, d)?;
+        let answer = answer(request.scheduler, &mut solver, &costs, (n, g), stream)?;
+        reply.goals.extend(answer.goals);
+        reply.log_probs.push(0.0);
+        reply.costs.push(answer.cost as f32);
+        reply.exact_costs.push(answer.exact_cost as f32);
+    }
+    Ok(reply)
+}
+
+/// Goals for one team.
+pub(crate) fn assign_team(kind: SchedulerKind, request: &TeamRequest) -> Result<TeamReply, AssignError> {
+    let costs = distances(&request.agents, &request.goals, request.dims)?;
+    let stream = || Key::new(request.seed, Purpose::Request, &[]).stream();
+    let shape = (request.agent_count, request.goal_count);
+    let answer = answer(kind, &mut Solver::default(), &costs, shape, stream)?;
+    let goals = answer.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
+    Ok(TeamReply { goals, probabilities: None })
+}
+
+/// Summed distance of the least-cost assignment of a team, and all distances `[N, G]`.
+pub(crate) fn exact_cost(request: &TeamRequest) -> Result<(f64, Vec<f64>), AssignError> {
+    let costs = distances(&request.agents, &request.goals, request.dims)?;
+    let exact = Solver::default().solve(&costs, request.agent_count, request.goal_count)?;
+    Ok((exact.cost, costs))
+}

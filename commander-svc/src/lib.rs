@@ -1,0 +1,8 @@
+//! magex-commander
+pub mod learned;
+mod assign;
+mod classical;
+pub mod scheduler;
+pub mod service;
+mod store;
+mod subscription;

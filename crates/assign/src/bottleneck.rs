@@ -1,0 +1,170 @@
+//! The bottleneck assignment: minimise the largest cost instead of the sum (the time at which the last agent arrives,
+//! if all fly at the same speed).
+//!
+//! Binary search over the sorted costs with Hopcroft & Karp's maximum matching (1973) on the pairs up to the threshold;
+//! among the assignments with the smallest largest cost, the one with the smallest sum.
+
+use crate::greedy::ascending;
+use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_costs, cost_of};
+
+const NONE: u32 = u32::MAX;
+
+/// A bottleneck-optimal assignment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bottleneck {
+    /// The matching and its summed cost, the smallest among those with this `largest`.
+    pub assignment: Assignment,
+    /// The smallest possible largest cost.
+    pub largest: f64,
+}
+
+/// Solves the bottleneck problem for `cost`, row-major `[rows, cols]`.
+///
+/// # Errors
+/// As [`Solver::solve`].
+pub fn bottleneck(cost: &[f64], rows: usize, cols: usize) -> Result<Bottleneck, AssignError> {
+    check_costs(cost, rows, cols)?;
+    let pairs = rows.min(cols);
+    let mut values = cost.to_vec();
+    values.sort_unstable_by_key(|&value| ascending(value));
+    values.dedup();
+    let mut matcher = Matcher::default();
+    let (mut low, mut high) = (0, values.len() - 1);
+    while low < high {
+        let middle = low + (high - low) / 2;
+        if matcher.run(cost, rows, cols, values[middle]) == pairs {
+            high = middle;
+        } else {
+            low = middle + 1;
+        }
+    }
+    let largest = values[low];
+    let assignment = cheapest_within(cost, rows, cols, largest, values.get(low + 1).copied(), values[0])?;
+    // Rounding of the penalty could only matter at the edge of the number range; the matching is the safe answer.
+    if assignment.pairs().all(|(row, col)| cost[row * cols + col] <= largest) {
+        return Ok(Bottleneck { assignment, largest });
+    }
+    matcher.run(cost, rows, cols, largest);
+    let col_of_row = matcher.col_of_row;
+    let sum = cost_of(cost, cols, &col_of_row);
+    Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
+}
+
+/// The cheapest assignment without the pairs above `largest`: they get a price that no sum of the others reaches.
+fn cheapest_within(
+    cost: &[f64],
+    rows: usize,
+    cols: usize,
+    largest: f64,
+    next: Option<f64>,
+    least: f64,
+) -> Result<Assignment, AssignError> {
+    let mut solver = Solver::default();
+    let Some(next) = next else {
+        return solver.solve(cost, rows, cols);
+    };
+    let penalty = (largest + (rows.min(cols) + 1) as f64 * (largest - least)).max(next).min(crate::LARGEST_COST);
+    let masked: Vec<f64> = cost.iter().map(|&value| if value <= largest { value } else { penalty }).collect();
+    let mut answer = solver.solve(&masked, rows, cols)?;
+    answer.cost = cost_of(cost, cols, &answer.col_of_row);
+    Ok(answer)
+}
+
+/// Hopcroft–Karp on the pairs with a cost up to a threshold.
+#[derive(Default)]
+struct Matcher {
+    edges: Vec<u32>,
+    /// `[rows + 1]` where each row's edges start.
+    start: Vec<usize>,
+    col_of_row: Vec<u32>,
+    row_of_col: Vec<u32>,
+    layer: Vec<u32>,
+    queue: Vec<u32>,
+    /// `[rows]` next edge to try.
+    cursor: Vec<usize>,
+    path: Vec<u32>,
+}
+
+impl Matcher {
+    /// Size of the largest matching.
+    fn run(&mut self, cost: &[f64], rows: usize, cols: usize, threshold: f64) -> usize {
+        self.edges.clear();
+        self.start.clear();
+        self.start.push(0);
+        for row in cost.chunks_exact(cols) {
+            self.edges.extend((0..cols as u32).filter(|&col| row[col as usize] <= threshold));
+            self.start.push(self.edges.len());
+        }
+        self.col_of_row = vec![UNASSIGNED; rows];
+        self.row_of_col = vec![NONE; cols];
+        let mut matched = 0;
+        while self.layers(rows) {
+            self.cursor.clear();
+            self.cursor.extend_from_slice(&self.start[..rows]);
+            for row in 0..rows as u32 {
+                if self.col_of_row[row as usize] == UNASSIGNED && self.extend(row) {
+                    matched += 1;
+                }
+            }
+        }
+        matched
+    }
+
+    /// Breadth-first layers of rows from the free ones; true if a free column can be reached.
+    fn layers(&mut self, rows: usize) -> bool {
+        self.layer.clear();
+        self.layer.resize(rows, NONE);
+        self.queue.clear();
+        for row in 0..rows {
+            if self.col_of_row[row] == UNASSIGNED {
+                self.layer[row] = 0;
+                self.queue.push(row as u32);
+            }
+        }
+        let (mut head, mut reached) = (0, false);
+        while head < self.queue.len() {
+            let row = self.queue[head] as usize;
+            head += 1;
+            for &col in &self.edges[self.start[row]..self.start[row + 1]] {
+                let owner = self.row_of_col[col as usize];
+                if owner == NONE {
+                    reached = true;
+                } else if self.layer[owner as usize] == NONE {
+                    self.layer[owner as usize] = self.layer[row] + 1;
+                    self.queue.push(owner);
+                }
+            }
+        }
+        reached
+    }
+
+    /// Depth-first search down the layers with an explicit stack (paths can be as long as there are rows).
+    fn extend(&mut self, start: u32) -> bool {
+        self.path.clear();
+        self.path.push(start);
+        while let Some(&row) = self.path.last() {
+            let row = row as usize;
+            if self.cursor[row] == self.start[row + 1] {
+                self.layer[row] = NONE;
+                self.path.pop();
+                continue;
+            }
+            let col = self.edges[self.cursor[row]];
+            self.cursor[row] += 1;
+            let owner = self.row_of_col[col as usize];
+            if owner == NONE {
+                // The last row takes the free column; every row before it takes the column of its successor.
+                let mut col = col;
+                while let Some(row) = self.path.pop() {
+                    self.row_of_col[col as usize] = row;
+                    col = std::mem::replace(&mut self.col_of_row[row as usize], col);
+                }
+                return true;
+            }
+            if self.layer[owner as usize] == self.layer[row].wrapping_add(1) && self.layer[row] != NONE {
+                self.path.push(owner);
+            }
+        }
+        false
+    }
+}

@@ -1,0 +1,347 @@
+//! The minimum-cost assignment, rectangular, in f64.
+//!
+//! Jonker & Volgenant 1987: column reduction, reduction transfer, one pass of augmenting row reduction (a second one
+//! costs more than it saves), then shortest augmenting paths (dense Dijkstra on reduced costs). With fewer rows than
+//! columns the column reduction is left out: a column that stays alone must keep the price 0, and only columns with a
+//! partner are ever repriced afterwards.
+//!
+//! Floating point: row prices are never stored (they follow from the matched entry), a repricing that rounds to nothing
+//! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
+//! lowest index, free columns first: the answer is a function of the input alone.
+
+use crate::{AssignError, Assignment, UNASSIGNED, check_costs, compensated_sum, distances_into};
+
+const NONE: u32 = u32::MAX;
+/// Columns are padded to whole groups of this size; each scan keeps this many independent minima.
+const LANES: usize = 8;
+
+/// The solver's memory. Reusing one solver allocates nothing but the answers.
+#[derive(Debug, Clone, Default)]
+pub struct Solver {
+    /// `[rows, stride]` with rows ≤ cols ≤ stride; +∞ in the padding.
+    cost: Vec<f64>,
+    stride: usize,
+    /// `[stride]` dual price of each column.
+    price: Vec<f64>,
+    /// `[stride]` the prices, −∞ where a column already belongs to the shortest-path tree.
+    open_price: Vec<f64>,
+    /// `[stride]` length of the shortest path to each column, +∞ in the tree.
+    distance: Vec<f64>,
+    /// Rows in the order they joined the tree, the free row first.
+    tree: Vec<Branch>,
+    /// `[stride]` cheapest row of each column.
+    cheapest: Vec<u32>,
+    row_of_col: Vec<u32>,
+    col_of_row: Vec<u32>,
+    free: Vec<u32>,
+    still_free: Vec<u32>,
+    points: Vec<f64>,
+}
+
+/// A row of the shortest-path tree.
+#[derive(Debug, Clone, Copy)]
+struct Branch {
+    row: u32,
+    /// The row's price for its own column, less the length of the path there: what its other columns add it to.
+    offset: f64,
+    /// The row's own column, by which it was reached.
+    col: u32,
+    /// Length of the path to that column.
+    length: f64,
+}
+
+/// Solves one problem; see [`Solver::solve`]. A caller with many problems keeps a [`Solver`].
+pub fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+    Solver::default().solve(cost, rows, cols)
+}
+
+/// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
+/// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
+pub fn exact_points(agents: &[f32], goals: &[f32], dims: usize) -> Result<(Vec<u32>, f64), AssignError> {
+    let answer = Solver::default().solve_points(agents, goals, dims)?;
+    Ok((answer.col_of_row, answer.cost))
+}
+
+impl Solver {
+    /// The assignment of min(rows, cols) pairs with the smallest summed cost; `cost` is row-major `[rows, cols]`.
+    ///
+    /// # Errors
+    /// Empty or mismatched shapes, and the first entry that is NaN, infinite or beyond 1e300.
+    pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+        check_costs(cost, rows, cols)?;
+        let wide = rows <= cols;
+        self.load(cost, rows, cols);
+        self.run(rows.min(cols), rows.max(cols));
+        let col_of_row = if wide {
+            self.col_of_row.clone()
+        } else {
+            // Solved as the transpose: the solver's columns are our rows, its padding is not.
+            self.row_of_col[..rows].iter().map(|&col| if col == NONE { UNASSIGNED } else { col }).collect()
+        };
+        let cost = compensated_sum(crate::pairs(&col_of_row).map(|(row, col)| cost[row * cols + col]));
+        Ok(Assignment { col_of_row, cost })
+    }
+
+    /// [`exact_points`] with this solver's memory.
+    ///
+    /// # Errors
+    /// Empty or ragged arrays and coordinates that are not finite.
+    pub fn solve_points(&mut self, agents: &[f32], goals: &[f32], dims: usize) -> Result<Assignment, AssignError> {
+        let mut points = std::mem::take(&mut self.points);
+        let answer =
+            distances_into(agents, goals, dims, &mut points).and_then(|(rows, cols)| self.solve(&points, rows, cols));
+        self.points = points;
+        answer
+    }
+
+    /// Copies the costs, transposed if there are more rows than columns, and pads every row.
+    fn load(&mut self, cost: &[f64], rows: usize, cols: usize) {
+        let (short, long) = (rows.min(cols), rows.max(cols));
+        self.stride = long.next_multiple_of(LANES);
+        self.cost.clear();
+        self.cost.reserve(short * self.stride);
+        for row in 0..short {
+            if rows <= cols {
+                self.cost.extend_from_slice(&cost[row * cols..(row + 1) * cols]);
+            } else {
+                self.cost.extend((0..rows).map(|i| cost[i * cols + row]));
+            }
+            self.cost.resize((row + 1) * self.stride, f64::INFINITY);
+        }
+    }
+
+    fn run(&mut self, rows: usize, cols: usize) {
+        let stride = self.stride;
+        refill(&mut self.price, stride, 0.0);
+        refill(&mut self.row_of_col, stride, NONE);
+        refill(&mut self.col_of_row, rows, NONE);
+        if cols == 1 {
+            self.row_of_col[0] = 0;
+            self.col_of_row[0] = 0;
+            return;
+        }
+        if rows == cols {
+            self.reduce_columns(cols);
+        }
+        self.free.clear();
+        self.free.extend((0..rows as u32).filter(|&row| self.col_of_row[row as usize] == NONE));
+        self.reduce_rows(rows);
+        let free = std::mem::take(&mut self.free);
+        for &row in &free {
+            self.augment(row);
+        }
+        self.free = free;
+    }
+
+    /// Column reduction: each column takes the price of its cheapest row, and the row if nobody has it yet. Then the
+    /// reduction transfer: a row chosen by one column only lowers that column's price as far as it stays its best.
+    fn reduce_columns(&mut self, cols: usize) {
+        let Self { cost, stride, price, cheapest, row_of_col, col_of_row, still_free, .. } = self;
+        price.copy_from_slice(&cost[..*stride]);
+        refill(cheapest, *stride, 0);
+        for (row, costs) in cost.chunks_exact(*stride).enumerate().skip(1) {
+            for ((price, cheapest), &cost) in price.iter_mut().zip(cheapest.iter_mut()).zip(costs) {
+                let lower = cost < *price;
+                *price = if lower { cost } else { *price };
+                *cheapest = if lower { row as u32 } else { *cheapest };
+            }
+        }
+        price[cols..].fill(0.0);
+        // `still_free` counts how many columns chose each row.
+        refill(still_free, cols, 0);
+        for col in (0..cols).rev() {
+            let row = cheapest[col] as usize;
+            if still_free[row] == 0 {
+                col_of_row[row] = col as u32;
+                row_of_col[col] = row as u32;
+            }
+            still_free[row] += 1;
+        }
+        for row in 0..cols {
+            if still_free[row] == 1 {
+                let costs = &cost[row * *stride..(row + 1) * *stride];
+                // Reduced costs are at least 0 and the row's own column is at 0: the second least is the least other.
+                let (_, second) = two_least(costs, price);
+                price[col_of_row[row] as usize] -= second;
+            }
+        }
+    }
+
+    /// Augmenting row reduction over the free rows: each takes its cheapest column at a price that makes the second
+    /// cheapest as good, and displaces the owner, who looks for another column at once.
+    fn reduce_rows(&mut self, rows: usize) {
+        let Self { cost, stride, price, row_of_col, col_of_row, free, still_free, .. } = self;
+        still_free.clear();
+        let mut budget = 4 * rows;
+        for &first in free.iter() {
+            let mut row = first;
+            loop {
+                let costs = &cost[row as usize * *stride..(row as usize + 1) * *stride];
+                let (least, second) = two_least(costs, price);
+                let mut col = find(costs, price, least, 0);
+                let lowered = price[col] - (second - least);
+                let progress = lowered < price[col];
+                if progress {
+                    price[col] = lowered;
+                } else if least == second && row_of_col[col] != NONE {
+                    col = find(costs, price, least, col + 1);
+                }
+                let displaced = std::mem::replace(&mut row_of_col[col], row);
+                col_of_row[row as usize] = col as u32;
+                if displaced == NONE {
+                    break;
+                }
+                col_of_row[displaced as usize] = NONE;
+                budget = budget.saturating_sub(1);
+                if !progress || budget == 0 {
+                    still_free.push(displaced);
+                    break;
+                }
+                row = displaced;
+            }
+        }
+        std::mem::swap(free, still_free);
+    }
+
+    /// Finds the shortest alternating path from a free row to a free column, reprices the columns of the tree and
+    /// flips the path.
+    fn augment(&mut self, start: u32) {
+        let Self { cost, stride, price, open_price, distance, tree, row_of_col, col_of_row, .. } = self;
+        let stride = *stride;
+        open_price.clear();
+        open_price.extend_from_slice(price);
+        refill(distance, stride, f64::INFINITY);
+        tree.clear();
+        tree.push(Branch { row: start, offset: 0.0, col: NONE, length: 0.0 });
+        let (mut row, mut offset) = (start, 0.0);
+        let (end, shortest) = loop {
+            let costs = &cost[row as usize * stride..(row as usize + 1) * stride];
+            let nearest = relax(costs, open_price, offset, distance);
+            let col = nearest_column(distance, nearest, row_of_col);
+            if row_of_col[col] == NONE {
+                break (col, nearest);
+            }
+            row = row_of_col[col];
+            offset = cost[row as usize * stride + col] - price[col] - nearest;
+            tree.push(Branch { row, offset, col: col as u32, length: nearest });
+            open_price[col] = f64::NEG_INFINITY;
+            distance[col] = f64::INFINITY;
+        };
+        // Walk back: the row before a column is the first of the tree that gives it its length, to the last bit.
+        let (mut col, mut length) = (end, shortest);
+        loop {
+            let gives =
+                |branch: &Branch| cost[branch.row as usize * stride + col] - price[col] - branch.offset == length;
+            let Some(branch) = tree.iter().find(|&branch| gives(branch)) else {
+                debug_assert!(false, "every length came from a row of the tree");
+                break;
+            };
+            row_of_col[col] = branch.row;
+            col_of_row[branch.row as usize] = col as u32;
+            if branch.row == start {
+                break;
+            }
+            (col, length) = (branch.col as usize, branch.length);
+        }
+        for branch in &tree[1..] {
+            price[branch.col as usize] += branch.length - shortest;
+        }
+    }
+}
+
+/// The two smallest cost − price of a row, equal if the smallest occurs twice.
+fn two_least(costs: &[f64], price: &[f64]) -> (f64, f64) {
+    let (mut least, mut second) = ([f64::INFINITY; LANES], [f64::INFINITY; LANES]);
+    for (costs, price) in costs.as_chunks::<LANES>().0.iter().zip(price.as_chunks::<LANES>().0) {
+        for lane in 0..LANES {
+            let reduced = costs[lane] - price[lane];
+            let larger = if reduced < least[lane] { least[lane] } else { reduced };
+            least[lane] = lower(reduced, least[lane]);
+            second[lane] = lower(larger, second[lane]);
+        }
+    }
+    let mut width = LANES / 2;
+    while width > 0 {
+        for lane in 0..width {
+            let (a, b) = (least[lane], least[lane + width]);
+            second[lane] = lower(lower(second[lane], second[lane + width]), if a < b { b } else { a });
+            least[lane] = lower(a, b);
+        }
+        width /= 2;
+    }
+    (least[0], second[0])
+}
+
+/// First column at or after `from` whose cost − price is `value`, which the caller has seen there.
+fn find(costs: &[f64], price: &[f64], value: f64, from: usize) -> usize {
+    let aligned = from.next_multiple_of(LANES).min(costs.len());
+    for col in from..aligned {
+        if costs[col] - price[col] == value {
+            return col;
+        }
+    }
+    let chunks = costs[aligned..].as_chunks::<LANES>().0.iter().zip(price[aligned..].as_chunks::<LANES>().0);
+    for (chunk, (costs, price)) in chunks.enumerate() {
+        let mut hit = [false; LANES];
+        for lane in 0..LANES {
+            hit[lane] = costs[lane] - price[lane] == value;
+        }
+        if hit.iter().fold(false, |any, &hit| any | hit) {
+            let lane = hit.iter().position(|&hit| hit).unwrap_or_default();
+            return aligned + chunk * LANES + lane;
+        }
+    }
+    debug_assert!(false, "the value was seen in this row");
+    0
+}
+
+/// Shortens the paths through a row and returns the length of the shortest path to a column outside the tree.
+fn relax(costs: &[f64], open_price: &[f64], offset: f64, distance: &mut [f64]) -> f64 {
+    let mut nearest = [f64::INFINITY; LANES];
+    let columns = costs.as_chunks::<LANES>().0.iter().zip(open_price.as_chunks::<LANES>().0);
+    for ((costs, price), distance) in columns.zip(distance.as_chunks_mut::<LANES>().0) {
+        for lane in 0..LANES {
+            distance[lane] = lower(costs[lane] - price[lane] - offset, distance[lane]);
+            nearest[lane] = lower(distance[lane], nearest[lane]);
+        }
+    }
+    let mut width = LANES / 2;
+    while width > 0 {
+        for lane in 0..width {
+            nearest[lane] = lower(nearest[lane], nearest[lane + width]);
+        }
+        width /= 2;
+    }
+    nearest[0]
+}
+
+/// The smaller one, as one instruction (f64::min would also look for NaN, which cannot occur here).
+#[inline(always)]
+fn lower(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+/// The column at this distance: the first one without an owner, which ends the search, else the first one.
+fn nearest_column(distance: &[f64], nearest: f64, row_of_col: &[u32]) -> usize {
+    let mut first = usize::MAX;
+    for (chunk, lengths) in distance.as_chunks::<LANES>().0.iter().enumerate() {
+        if lengths.iter().fold(false, |any, &length| any | (length == nearest)) {
+            for (lane, &length) in lengths.iter().enumerate() {
+                let col = chunk * LANES + lane;
+                if length == nearest && row_of_col[col] == NONE {
+                    return col;
+                }
+                if length == nearest && first == usize::MAX {
+                    first = col;
+                }
+            }
+        }
+    }
+    debug_assert!(first != usize::MAX, "the nearest column was seen");
+    first
+}
+
+fn refill<T: Copy>(buffer: &mut Vec<T>, length: usize, value: T) {
+    buffer.clear();
+    buffer.resize(length, value);
+}

@@ -1,0 +1,216 @@
+//! Who goes where: assignment of agents to goals by distance.
+//!
+//! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 6), [`bottleneck()`] minimises the longest
+//! distance instead of the sum, [`greedy()`], [`random`] and [`two_swap`] are the baselines a learned commander is
+//! compared with, and [`duals`] are entropic transport prices, a feature for such a commander.
+//!
+//! Costs are row-major `[rows, cols]`: rows are agents, columns are goals. Either side may be the longer one; it then
+//! keeps members without a partner, marked [`UNASSIGNED`].
+
+use thiserror::Error;
+
+pub mod bench;
+pub mod bottleneck;
+pub mod duals;
+pub mod exact;
+pub mod golden;
+pub mod greedy;
+pub mod random;
+pub mod two_swap;
+
+pub use bottleneck::bottleneck;
+pub use exact::{Solver, exact, exact_points};
+pub use greedy::greedy;
+
+/// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).
+pub const UNASSIGNED: u32 = u32::MAX;
+
+/// Largest magnitude of a cost. Sums along a path of any length stay finite below it.
+pub const LARGEST_COST: f64 = 1e300;
+
+/// Why an assignment problem was refused.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum AssignError {
+    /// No rows or no columns.
+    #[error("cost: {rows} rows by {cols} columns is empty; both must be at least 1")]
+    Empty {
+        /// Rows asked for.
+        rows: usize,
+        /// Columns asked for.
+        cols: usize,
+    },
+    /// More rows or columns than an index can name.
+    #[error("cost: {rows} rows by {cols} columns is too large; both must be below 2^31")]
+    TooLarge {
+        /// Rows asked for.
+        rows: usize,
+        /// Columns asked for.
+        cols: usize,
+    },
+    /// An array does not have the length its shape asks for.
+    #[error("{field}: {found} numbers, the shape asks for {expected}")]
+    Size {
+        /// Which array.
+        field: &'static str,
+        /// Its length.
+        found: usize,
+        /// What the shape asks for.
+        expected: usize,
+    },
+    /// NaN, infinite or beyond [`LARGEST_COST`].
+    #[error("cost[{row}][{col}]: {value} is not a finite number up to 1e300")]
+    Entry {
+        /// Row of the entry.
+        row: usize,
+        /// Column of the entry.
+        col: usize,
+        /// The entry.
+        value: f64,
+    },
+    /// A coordinate is NaN or infinite.
+    #[error("{field}[{point}][{axis}]: {value} is not finite")]
+    Coordinate {
+        /// `agents` or `goals`.
+        field: &'static str,
+        /// Index of the point.
+        point: usize,
+        /// Index of the coordinate.
+        axis: usize,
+        /// The coordinate.
+        value: f32,
+    },
+    /// A number that steers an algorithm is out of range.
+    #[error("{field}: {value} is out of range; {remedy}")]
+    Parameter {
+        /// Which parameter.
+        field: &'static str,
+        /// Its value.
+        value: f64,
+        /// What to do.
+        remedy: &'static str,
+    },
+}
+
+/// A matching of min(rows, cols) pairs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Assignment {
+    /// `[rows]` column of each row, or [`UNASSIGNED`].
+    pub col_of_row: Vec<u32>,
+    /// Sum of the chosen costs (compensated summation).
+    pub cost: f64,
+}
+
+impl Assignment {
+    /// The column of a row, if it has one.
+    pub fn col(&self, row: usize) -> Option<u32> {
+        self.col_of_row.get(row).copied().filter(|&col| col != UNASSIGNED)
+    }
+
+    /// (row, column) of every pair, rows ascending.
+    pub fn pairs(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        pairs(&self.col_of_row)
+    }
+}
+
+/// (row, column) of every pair of a column list, rows ascending.
+pub(crate) fn pairs(col_of_row: &[u32]) -> impl Iterator<Item = (usize, usize)> + '_ {
+    col_of_row.iter().enumerate().filter(|&(_, &col)| col != UNASSIGNED).map(|(row, &col)| (row, col as usize))
+}
+
+/// Sum of the costs `[rows, cols]` chosen by a column list, in row order with Neumaier's compensation.
+pub fn cost_of(cost: &[f64], cols: usize, col_of_row: &[u32]) -> f64 {
+    compensated_sum(pairs(col_of_row).map(|(row, col)| cost[row * cols + col]))
+}
+
+pub(crate) fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
+    let (mut sum, mut lost) = (0.0f64, 0.0f64);
+    for term in terms {
+        let next = sum + term;
+        lost += if sum.abs() >= term.abs() { (sum - next) + term } else { (term - next) + sum };
+        sum = next;
+    }
+    sum + lost
+}
+
+/// Checks shape and entries of a cost matrix `[rows, cols]`.
+pub fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<(), AssignError> {
+    check_shape(rows, cols)?;
+    // A product that overflows cannot be the length of anything, so saturating is enough to refuse it.
+    let expected = rows.saturating_mul(cols);
+    if cost.len() != expected {
+        return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
+    }
+    // Counting instead of searching vectorises.
+    let bad = cost.iter().filter(|&&value| !usable(value)).count();
+    if bad == 0 {
+        return Ok(());
+    }
+    let place = cost.iter().position(|&value| !usable(value)).unwrap_or_default();
+    Err(AssignError::Entry { row: place / cols, col: place % cols, value: cost[place] })
+}
+
+/// False for NaN too.
+fn usable(cost: f64) -> bool {
+    cost.abs() <= LARGEST_COST
+}
+
+pub(crate) fn check_shape(rows: usize, cols: usize) -> Result<(), AssignError> {
+    if rows == 0 || cols == 0 {
+        return Err(AssignError::Empty { rows, cols });
+    }
+    if rows.max(cols) >= 1 << 31 {
+        return Err(AssignError::TooLarge { rows, cols });
+    }
+    Ok(())
+}
+
+/// Distances `[rows, cols]` in f64 between f32 points: agents `[rows, dims]`, goals `[cols, dims]`.
+pub fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>, AssignError> {
+    let mut cost = Vec::new();
+    distances_into(agents, goals, dims, &mut cost)?;
+    Ok(cost)
+}
+
+/// [`distances`] into a buffer that is reused; returns (rows, cols).
+pub(crate) fn distances_into(
+    agents: &[f32],
+    goals: &[f32],
+    dims: usize,
+    cost: &mut Vec<f64>,
+) -> Result<(usize, usize), AssignError> {
+    if dims == 0 {
+        return Err(AssignError::Parameter { field: "dims", value: 0.0, remedy: "use at least 1" });
+    }
+    for (field, points) in [("agents", agents), ("goals", goals)] {
+        if !points.len().is_multiple_of(dims) {
+            let expected = points.len().div_ceil(dims) * dims;
+            return Err(AssignError::Size { field, found: points.len(), expected });
+        }
+        if let Some(place) = points.iter().position(|x| !x.is_finite()) {
+            let (point, axis) = (place / dims, place % dims);
+            return Err(AssignError::Coordinate { field, point, axis, value: points[place] });
+        }
+    }
+    let (rows, cols) = (agents.len() / dims, goals.len() / dims);
+    check_shape(rows, cols)?;
+    cost.clear();
+    cost.reserve(rows * cols);
+    for agent in agents.chunks_exact(dims) {
+        if let &[x, y] = agent {
+            let (x, y) = (f64::from(x), f64::from(y));
+            cost.extend(goals.as_chunks::<2>().0.iter().map(|&[gx, gy]| {
+                let (dx, dy) = (x - f64::from(gx), y - f64::from(gy));
+                (dx * dx + dy * dy).sqrt()
+            }));
+        } else {
+            cost.extend(goals.chunks_exact(dims).map(|goal| {
+                let square = |(&a, &g): (&f32, &f32)| (f64::from(a) - f64::from(g)) * (f64::from(a) - f64::from(g));
+                agent.iter().zip(goal).map(square).sum::<f64>().sqrt()
+            }));
+        }
+    }
+    Ok((rows, cols))
+}
+
+#[cfg(test)]
+mod tests;

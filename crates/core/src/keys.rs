@@ -1,0 +1,44 @@
+//! Which stream serves which episode of which shard: one place, used by actors (to roll out), commander (to sample
+//! goals) and learner (to replay the graph's noise).
+
+use crate::ids::{Shard, ShardKind};
+use crate::rng::{Key, Purpose};
+
+/// Streams of one episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EpisodeKeys {
+    /// Spawn positions.
+    pub spawn: Key,
+    /// Executor actions.
+    pub action: Key,
+    /// Gumbel noise of the executor's graph.
+    pub graph: Key,
+    /// Goal sampling.
+    pub commander: Key,
+}
+
+/// Keys of the b-th episode of a shard. Evaluation episodes are named by their set and index alone, so that a set does
+/// not depend on how it was cut into shards, nor on the iteration.
+pub fn episode_keys(seed: u64, shard: &Shard, b: u32) -> EpisodeKeys {
+    let episode = shard.first_episode + b;
+    match shard.kind {
+        ShardKind::Train => {
+            let key = |purpose| Key::new(seed, purpose, &[shard.iteration.0, episode]);
+            EpisodeKeys {
+                spawn: key(Purpose::Spawn),
+                action: key(Purpose::Action),
+                graph: key(Purpose::Graph),
+                commander: key(Purpose::Commander),
+            }
+        }
+        ShardKind::Eval => {
+            let key = |purpose| Key::new(seed, purpose, &[shard.eval_set, episode]);
+            EpisodeKeys {
+                spawn: key(Purpose::EvalSpawn),
+                action: key(Purpose::EvalAction),
+                graph: key(Purpose::EvalGraph),
+                commander: key(Purpose::EvalCommander),
+            }
+        }
+    }
+}

@@ -1,0 +1,11 @@
+//! What every part of MAGE-X agrees on and nothing else: the configuration of a run, the description of a task,
+//! the names of things (iterations, shards, versions) and the keyed random streams.
+//!
+//! The learner knows a task only by its [`task::TaskConfig`]; the physics lives in `magex-env`.
+
+pub mod config;
+pub mod ids;
+pub mod keys;
+pub mod rng;
+pub mod task;
+pub mod trajectory;

@@ -1,0 +1,162 @@
+//! What comes back from a shard: a trajectory to train on, or the metrics of evaluation episodes.
+
+use crate::ids::Shard;
+use serde::{Deserialize, Serialize};
+
+/// Sizes of a shard's arrays.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Shape {
+    /// T: joint steps per episode.
+    pub steps: usize,
+    /// B: episodes.
+    pub episodes: usize,
+    /// N: agents.
+    pub agents: usize,
+    /// E: moving bodies, agents first (Simple Spread: E = N).
+    pub bodies: usize,
+    /// G: fixed landmarks.
+    pub landmarks: usize,
+    /// D: space dimensions.
+    pub dims: usize,
+    /// K: targets per agent (Simple Spread: 1, its landmark).
+    pub targets: usize,
+    /// H: components of an action.
+    pub heads: usize,
+}
+
+/// B whole episodes of T joint steps as the actor saw them: states, not observations. All arrays are row-major.
+/// Index t of a state is the state *before* action t; index T is the true last state, before any reset.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trajectory {
+    /// Which shard this is the result of.
+    pub shard: Shard,
+    /// Sizes of the arrays below.
+    pub shape: Shape,
+    /// [T+1, B, E, D] world units.
+    pub positions: Vec<f32>,
+    /// [T+1, B, E, D] world units per second.
+    pub velocities: Vec<f32>,
+    /// [B, G, D] world units.
+    pub landmarks: Vec<f32>,
+    /// [B, N, K] what each agent was assigned: an index into landmarks (or into the bodies, by task).
+    pub goals: Vec<u32>,
+    /// [T, B, N, H]
+    pub actions: Vec<u8>,
+    /// [T, B, N] log-probability of the whole action under the weights named by the shard.
+    pub log_probs: Vec<f32>,
+    /// [T, B, N]
+    pub rewards: Vec<f32>,
+    /// [B] log-probability of the commander's assignment.
+    pub goal_log_probs: Vec<f32>,
+    /// [B] C_c: summed distance of the commander's assignment.
+    pub costs: Vec<f32>,
+    /// [B] C_h: summed distance of the exact assignment.
+    pub exact_costs: Vec<f32>,
+    /// [B] metrics of each episode.
+    pub metrics: Vec<EpisodeMetrics>,
+}
+
+/// What one episode scored.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeMetrics {
+    /// Share of landmarks with any agent within 0.15 at the last step.
+    pub success: f32,
+    /// Share of landmarks that can be matched one-to-one to agents within 0.15 at the last step.
+    pub matched_success: f32,
+    /// First step after which at least 99 % of the landmarks were covered; the horizon + 1 if it never happened.
+    pub arrival_step: u32,
+    /// Other agents closer than two radii, per agent and step.
+    pub collisions_per_agent_step: f32,
+    /// Mean reward per agent and step.
+    pub reward: f32,
+    /// C_c / C_h at the start of the episode.
+    pub cost_ratio: f32,
+}
+
+/// The states of one episode, to be looked at.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Recording {
+    /// Sizes; `episodes` = 1.
+    pub shape: Shape,
+    /// [T+1, E, D]
+    pub positions: Vec<f32>,
+    /// [G, D]
+    pub landmarks: Vec<f32>,
+    /// [N, K]
+    pub goals: Vec<u32>,
+}
+
+/// Result of an evaluation shard.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EvalOutcome {
+    /// Which shard this is the result of.
+    pub shard: Shard,
+    /// One entry per episode.
+    pub metrics: Vec<EpisodeMetrics>,
+    /// The shard's first episode, if it was asked for.
+    pub recording: Option<Recording>,
+}
+
+/// Result of a shard of either kind.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ShardResult {
+    /// A trajectory to train on.
+    Train(Trajectory),
+    /// Metrics only.
+    Eval(EvalOutcome),
+}
+
+impl ShardResult {
+    /// The shard it belongs to.
+    pub fn shard(&self) -> &Shard {
+        match self {
+            Self::Train(trajectory) => &trajectory.shard,
+            Self::Eval(outcome) => &outcome.shard,
+        }
+    }
+}
+
+impl Trajectory {
+    /// Checks every array against the shape, every number for finiteness and every index for its range.
+    /// `Err` names the field and the place.
+    pub fn validate(&self) -> Result<(), String> {
+        let s = &self.shape;
+        let (t, b, n) = (s.steps, s.episodes, s.agents);
+        let state = (t + 1) * b * s.bodies * s.dims;
+        let floats: [(&str, &[f32], usize); 8] = [
+            ("positions", &self.positions, state),
+            ("velocities", &self.velocities, state),
+            ("landmarks", &self.landmarks, b * s.landmarks * s.dims),
+            ("log_probs", &self.log_probs, t * b * n),
+            ("rewards", &self.rewards, t * b * n),
+            ("goal_log_probs", &self.goal_log_probs, b),
+            ("costs", &self.costs, b),
+            ("exact_costs", &self.exact_costs, b),
+        ];
+        for (name, data, expected) in floats {
+            if data.len() != expected {
+                return Err(format!("trajectory.{name}: {} numbers, the shape asks for {expected}", data.len()));
+            }
+            if let Some(place) = data.iter().position(|x| !x.is_finite()) {
+                return Err(format!("trajectory.{name}[{place}]: {} is not finite", data[place]));
+            }
+        }
+        if let Some(place) = self.log_probs.iter().position(|&x| x > 1e-4) {
+            return Err(format!("trajectory.log_probs[{place}]: {} is above 0", self.log_probs[place]));
+        }
+        if self.goals.len() != b * n * s.targets {
+            return Err(format!("trajectory.goals: {} entries, the shape asks for {}", self.goals.len(), b * n * s.targets));
+        }
+        let bound = s.landmarks.max(s.bodies) as u32;
+        if let Some(place) = self.goals.iter().position(|&g| g >= bound) {
+            return Err(format!("trajectory.goals[{place}]: {} is not below {bound}", self.goals[place]));
+        }
+        if self.actions.len() != t * b * n * s.heads {
+            return Err(format!("trajectory.actions: {} entries, the shape asks for {}", self.actions.len(), t * b * n * s.heads));
+        }
+        if self.metrics.len() != b {
+            return Err(format!("trajectory.metrics: {} entries, the shape asks for {b}", self.metrics.len()));
+        }
+        Ok(())
+    }
+}

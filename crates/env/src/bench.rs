@@ -1,0 +1,80 @@
+//! How fast the environment runs. The only part of the crate that looks at a clock; nothing else depends on it.
+
+use crate::batch::Batch;
+use crate::error::EnvError;
+use crate::real::Real;
+use crate::spread::{LANES, Spread};
+use magex_core::rng::{Key, Purpose};
+use magex_core::task::{Spawn, TaskConfig};
+use std::time::Instant;
+
+/// Joint steps in the table of random actions.
+const TABLE: usize = 64;
+
+/// Joint steps per second of one core: `worlds` episodes of N agents, random actions from a keyed table, spawned
+/// anew and scored at every horizon; contacts, collisions, rewards and arrival included. Runs for about `seconds`.
+pub fn throughput(agents: usize, worlds: usize, seconds: f64) -> Result<f64, EnvError> {
+    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
+    let table = random_actions(agents * worlds);
+    let mut rewards = vec![0.0; agents * worlds];
+    let goals: Vec<u32> = (0..worlds).flat_map(|_| 0..agents as u32).collect();
+    let ratios = vec![1.0; worlds];
+    let (start, mut joint_steps, mut round) = (Instant::now(), 0u64, 0);
+    loop {
+        let streams = (0..worlds as u32).map(|world| Key::new(1, Purpose::Bench, &[1, round, world]).stream());
+        let mut spread = Spread::new(&task, streams)?;
+        spread.set_goals(&goals)?;
+        for step in 0..task.horizon as usize {
+            spread.step(&table[step % TABLE], &mut rewards)?;
+            joint_steps += worlds as u64;
+            if step % TABLE == 0 && start.elapsed().as_secs_f64() >= seconds {
+                return Ok(joint_steps as f64 / start.elapsed().as_secs_f64());
+            }
+        }
+        std::hint::black_box(spread.metrics(&ratios)?);
+        round += 1;
+    }
+}
+
+/// The same steps without spawning and scoring, in f32 and in f64: joint steps per second of each.
+pub fn precisions(agents: usize, worlds: usize, seconds: f64) -> Result<[f64; 2], EnvError> {
+    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
+    let streams = (0..worlds as u32).map(|world| Key::new(1, Purpose::Bench, &[1, 0, world]).stream());
+    let spread = Spread::new(&task, streams)?;
+    let (positions, landmarks) = (spread.positions(), spread.landmarks());
+    let table = random_actions(agents * worlds);
+    Ok([
+        steps_only::<f32>(&task, &positions, landmarks, &table, seconds),
+        steps_only::<f64>(&task, &positions, landmarks, &table, seconds),
+    ])
+}
+
+fn steps_only<R: Real>(
+    task: &TaskConfig,
+    positions: &[f32],
+    landmarks: &[f32],
+    table: &[Vec<u8>],
+    seconds: f64,
+) -> f64 {
+    let convert = |values: &[f32]| -> Vec<R> { values.iter().map(|&v| R::from_f64(f64::from(v))).collect() };
+    let (positions, landmarks) = (convert(positions), convert(landmarks));
+    let velocities = vec![R::ZERO; positions.len()];
+    let mut rewards = vec![R::ZERO; positions.len() / 2];
+    let worlds = positions.len() / (2 * task.agents);
+    let (start, mut joint_steps) = (Instant::now(), 0);
+    loop {
+        let mut batch = Batch::<R, LANES>::new(task, &positions, &velocities, landmarks.clone(), false);
+        for (step, actions) in table.iter().enumerate() {
+            batch.step(step as u32 + 1, actions, &mut rewards);
+            joint_steps += worlds;
+        }
+        if start.elapsed().as_secs_f64() >= seconds {
+            return joint_steps as f64 / start.elapsed().as_secs_f64();
+        }
+    }
+}
+
+fn random_actions(numbers: usize) -> Vec<Vec<u8>> {
+    let mut stream = Key::new(1, Purpose::Bench, &[2]).stream();
+    (0..TABLE).map(|_| (0..numbers).map(|_| stream.below(5) as u8).collect()).collect()
+}

@@ -1,0 +1,92 @@
+//! JSON values that know where they are, so that every complaint names its field.
+
+use super::GoldenError;
+use serde_json::Value;
+
+/// A value and its path in the file.
+#[derive(Debug, Clone)]
+pub(super) struct Field<'a> {
+    path: String,
+    value: &'a Value,
+}
+
+impl<'a> Field<'a> {
+    /// The whole file.
+    pub(super) fn root(value: &'a Value) -> Self {
+        Self { path: String::new(), value }
+    }
+
+    /// A complaint about this field.
+    pub(super) fn wrong(&self, problem: impl Into<String>) -> GoldenError {
+        let field = if self.path.is_empty() { "recording" } else { &self.path };
+        GoldenError::Field { field: field.to_owned(), problem: problem.into() }
+    }
+
+    /// A member of an object.
+    pub(super) fn get(&self, name: &str) -> Result<Field<'a>, GoldenError> {
+        let path = if self.path.is_empty() { name.to_owned() } else { format!("{}.{name}", self.path) };
+        let object = self.value.as_object().ok_or_else(|| self.wrong("must be an object"))?;
+        match object.get(name) {
+            Some(value) => Ok(Field { path, value }),
+            None => Err(GoldenError::Field { field: path, problem: "is missing".into() }),
+        }
+    }
+
+    /// Whether the field is JSON's null.
+    pub(super) fn is_null(&self) -> bool {
+        self.value.is_null()
+    }
+
+    pub(super) fn text(&self) -> Result<&'a str, GoldenError> {
+        self.value.as_str().ok_or_else(|| self.wrong("must be a string"))
+    }
+
+    pub(super) fn flag(&self) -> Result<bool, GoldenError> {
+        self.value.as_bool().ok_or_else(|| self.wrong("must be true or false"))
+    }
+
+    /// A finite number.
+    pub(super) fn number(&self) -> Result<f64, GoldenError> {
+        let number = self.value.as_f64().filter(|number| number.is_finite());
+        number.ok_or_else(|| self.wrong("must be a finite number"))
+    }
+
+    /// A finite number above zero.
+    pub(super) fn positive(&self) -> Result<f64, GoldenError> {
+        let number = self.number()?;
+        if number > 0.0 { Ok(number) } else { Err(self.wrong(format!("{number} must be above 0"))) }
+    }
+
+    /// A whole number in 0..bound.
+    pub(super) fn index(&self, bound: usize) -> Result<usize, GoldenError> {
+        let index = self.value.as_u64().and_then(|index| usize::try_from(index).ok());
+        index.filter(|&index| index < bound).ok_or_else(|| self.wrong(format!("must be a whole number below {bound}")))
+    }
+
+    /// The elements of a list of known length.
+    pub(super) fn list(&self, len: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, GoldenError> {
+        let list = self.value.as_array().ok_or_else(|| self.wrong("must be a list"))?;
+        if list.len() != len {
+            return Err(self.wrong(format!("has {} entries, {len} are needed", list.len())));
+        }
+        let path = self.path.clone();
+        Ok(list.iter().enumerate().map(move |(k, value)| Field { path: format!("{path}[{k}]"), value }))
+    }
+
+    /// Every element of a list of known length, read.
+    pub(super) fn each<T>(
+        &self,
+        len: usize,
+        read: impl Fn(&Field<'a>) -> Result<T, GoldenError>,
+    ) -> Result<Vec<T>, GoldenError> {
+        self.list(len)?.map(|field| read(&field)).collect()
+    }
+
+    /// A list of points `[len][2]`.
+    pub(super) fn points(&self, len: usize) -> Result<Vec<[f64; 2]>, GoldenError> {
+        self.each(len, |point| {
+            let pair = point.each(2, Field::number)?;
+            Ok([pair[0], pair[1]])
+        })
+    }
+}

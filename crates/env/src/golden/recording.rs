@@ -1,0 +1,172 @@
+//! A recording as data.
+
+use super::GoldenError;
+use super::reader::Field;
+
+/// Most bodies and steps a recording may have: far beyond any, small enough that sizes cannot overflow.
+const MOST: usize = 1_000_000;
+/// Most agents, so that a pair of them can be named by 32 bits.
+const MOST_AGENTS: usize = 1 << 16;
+
+/// An agent or a landmark.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Body {
+    /// Radius in world units.
+    pub size: f64,
+    /// Mass.
+    pub mass: f64,
+    /// Whether forces move it.
+    pub movable: bool,
+    /// Whether it takes part in contacts.
+    pub collide: bool,
+}
+
+/// The bodies' state after a step, and what the authors' code said about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// `[N + G]` agents, then landmarks.
+    pub positions: Vec<[f64; 2]>,
+    /// `[N + G]`
+    pub velocities: Vec<[f64; 2]>,
+    /// `[N]`
+    pub rewards: Vec<f64>,
+    /// Covered landmarks / G.
+    pub success_rate: f64,
+    /// Pairs of colliding bodies closer than the sum of their radii.
+    pub overlaps: usize,
+}
+
+/// One recorded episode of Simple Spread.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recording {
+    /// Its name.
+    pub name: String,
+    /// Seconds per step.
+    pub dt: f64,
+    /// Share of the velocity lost per step.
+    pub damping: f64,
+    /// Stiffness of a contact.
+    pub contact_force: f64,
+    /// Softness of a contact in world units.
+    pub contact_margin: f64,
+    /// Force of an action.
+    pub sensitivity: f64,
+    /// Direction of each action.
+    pub directions: [[f64; 2]; 5],
+    /// `[N]`
+    pub agents: Vec<Body>,
+    /// `[G]`
+    pub landmarks: Vec<Body>,
+    /// `[N]` landmark of each agent.
+    pub goals: Vec<usize>,
+    /// Unit of the distances in the reward.
+    pub distance_unit: f64,
+    /// `[T][N]`
+    pub actions: Vec<Vec<u8>>,
+    /// `[T + 1]` frame t is the state before step t.
+    pub frames: Vec<Frame>,
+    /// `[T]` how far a perturbation of 1e-12 has grown after each step.
+    pub divergence: Vec<f64>,
+}
+
+impl Recording {
+    /// Reads the format `mpe-golden-1`. Every error names its field.
+    pub fn parse(text: &str) -> Result<Self, GoldenError> {
+        let value: serde_json::Value = serde_json::from_str(text)?;
+        let root = Field::root(&value);
+        let format = root.get("format")?.text()?;
+        if format != "mpe-golden-1" {
+            return Err(GoldenError::Format { found: format.to_owned() });
+        }
+        let scenario = root.get("scenario")?.text()?;
+        if scenario != "spread" {
+            return Err(GoldenError::UnsupportedScenario { found: scenario.to_owned() });
+        }
+        let n = root.get("n_agents")?.index(MOST_AGENTS)?;
+        let g = root.get("n_landmarks")?.index(MOST)?;
+        let steps = root.get("T")?.index(MOST)?;
+        root.get("n_balls")?.index(1)?;
+        if n == 0 || g == 0 {
+            return Err(root.get(if n == 0 { "n_agents" } else { "n_landmarks" })?.wrong("must be at least 1"));
+        }
+        let bodies = Self::bodies(&root.get("entities")?, n, g)?;
+        let meta = root.get("meta")?;
+        if meta.get("max_speed").is_ok_and(|speed| !speed.is_null()) {
+            return Err(meta.get("max_speed")?.wrong("is not supported; must be null"));
+        }
+        Ok(Self {
+            name: root.get("name")?.text()?.to_owned(),
+            dt: meta.get("dt")?.positive()?,
+            damping: meta.get("damping")?.number()?,
+            contact_force: meta.get("contact_force")?.number()?,
+            contact_margin: meta.get("contact_margin")?.positive()?,
+            sensitivity: meta.get("action_sensitivity")?.number()?,
+            directions: Self::directions(&meta.get("action_uxuy")?)?,
+            landmarks: bodies[n..].to_vec(),
+            agents: bodies[..n].to_vec(),
+            goals: root.get("goal")?.each(n, |goal| goal.index(g))?,
+            distance_unit: root.get("al_max_dis")?.positive()?,
+            actions: root.get("actions")?.each(steps, |step| step.each(n, |a| Ok(a.index(5)? as u8)))?,
+            frames: Self::frames(&root, n, g, steps)?,
+            divergence: root.get("divergence_1e-12")?.each(steps, Field::number)?,
+        })
+    }
+
+    fn directions(field: &Field<'_>) -> Result<[[f64; 2]; 5], GoldenError> {
+        let mut directions = [[0.0; 2]; 5];
+        for (action, direction) in directions.iter_mut().enumerate() {
+            let pair = field.get(&action.to_string())?.each(2, Field::number)?;
+            *direction = [pair[0], pair[1]];
+        }
+        Ok(directions)
+    }
+
+    fn bodies<'a>(field: &Field<'a>, n: usize, g: usize) -> Result<Vec<Body>, GoldenError> {
+        let read = |(k, body): (usize, Field<'a>)| {
+            let (kind, expected) = (body.get("kind")?, if k < n { "agent" } else { "landmark" });
+            if kind.text()? != expected {
+                return Err(kind.wrong(format!("must be '{expected}': agents come first, then landmarks")));
+            }
+            let body = Body {
+                size: body.get("size")?.positive()?,
+                mass: body.get("mass")?.positive()?,
+                movable: body.get("movable")?.flag()?,
+                collide: body.get("collide")?.flag()?,
+            };
+            Ok((body, kind))
+        };
+        let bodies: Vec<_> = field.list(n + g)?.enumerate().map(read).collect::<Result<_, _>>()?;
+        if let Some((_, kind)) = bodies[n..].iter().find(|(body, _)| body.movable || body.collide) {
+            return Err(kind.wrong("a landmark of scenario spread neither moves nor collides"));
+        }
+        Ok(bodies.into_iter().map(|(body, _)| body).collect())
+    }
+
+    fn frames(root: &Field<'_>, n: usize, g: usize, steps: usize) -> Result<Vec<Frame>, GoldenError> {
+        let points = |field: &Field<'_>| field.points(n + g);
+        let numbers = |field: &Field<'_>| field.each(n, Field::number);
+        let first = Frame {
+            positions: points(&root.get("init_pos")?)?,
+            velocities: points(&root.get("init_vel")?)?,
+            rewards: numbers(&root.get("init_reward_exe")?)?,
+            success_rate: root.get("init_success_rate")?.number()?,
+            overlaps: root.get("init_overlaps")?.index(usize::MAX)?,
+        };
+        let positions = root.get("pos")?.each(steps, points)?;
+        let velocities = root.get("vel")?.each(steps, points)?;
+        let rewards = root.get("reward_exe")?.each(steps, numbers)?;
+        let success = root.get("success_rate")?.each(steps, Field::number)?;
+        let overlaps = root.get("overlaps")?.each(steps, |count| count.index(usize::MAX))?;
+        let states = positions.into_iter().zip(velocities);
+        let rest = states.zip(rewards).zip(success.into_iter().zip(overlaps)).map(
+            |(((positions, velocities), rewards), (success_rate, overlaps))| Frame {
+                positions,
+                velocities,
+                rewards,
+                success_rate,
+                overlaps,
+            },
+        );
+        Ok(std::iter::once(first).chain(rest).collect())
+    }
+}

@@ -1,0 +1,27 @@
+//! The Simple Spread task (paper, section 5.1.1): physics, spawn, reward, metrics, the scripted controller used as a
+//! yardstick, and the check of all of it against recordings of the authors' simulator.
+//!
+//! [`Spread`] is a batch of B independent episodes stepped together, one world per SIMD lane. An episode is a pure
+//! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and
+//! on any machine.
+//!
+//! No networks, no threads, no clock (except in [`mod@bench`], which measures).
+
+pub mod bench;
+pub mod golden;
+pub mod layouts;
+pub mod scripted;
+pub mod spawn;
+
+mod arrival;
+mod batch;
+mod cells;
+mod error;
+mod matching;
+mod physics;
+mod real;
+mod spread;
+
+pub use error::EnvError;
+pub use real::Real;
+pub use spread::{CONTACT_DISTANCE, COVER_RADIUS, Spread};

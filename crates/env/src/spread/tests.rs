@@ -1,0 +1,216 @@
+use super::*;
+use magex_core::rng::{Key, Purpose};
+use magex_core::task::Spawn;
+
+fn streams(count: u32) -> impl Iterator<Item = Stream> {
+    (0..count).map(|episode| Key::new(3, Purpose::Spawn, &[0, 0, episode]).stream())
+}
+
+fn task(agents: usize) -> TaskConfig {
+    TaskConfig::simple_spread(agents, Spawn::Uniform)
+}
+
+/// Three agents at rest: two overlapping ones and one on its landmark.
+fn hand_made() -> (TaskConfig, Spread) {
+    let mut task = task(3);
+    task.side = 4.0;
+    task.reward.distance_unit = 2.0;
+    task.reward.bonus = 3.0;
+    task.reward.distance = 0.5;
+    task.reward.collision = 0.25;
+    let positions = [0.0, 0.0, 0.125, 0.0, 1.5, 1.5];
+    let landmarks = [1.0, 0.0, -1.0, 0.0, 1.5, 1.5];
+    let spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
+    (task, spread)
+}
+
+#[test]
+fn the_reward_is_the_documented_one_of_the_state_after_the_step() {
+    let (_, mut spread) = hand_made();
+    spread.set_goals(&[0, 1, 2]).unwrap();
+    let mut rewards = [f32::NAN; 3];
+    spread.step(&[0, 0, 3], &mut rewards).unwrap();
+    // The overlap of 0.075 pushes with 7.5: v = 0.75, x = 0.075 apart from where they were, 0.275 from each other.
+    // Agent 2 thrusts with 5: v = 0.5, moves by 0.05 and is still within 0.15 of its landmark.
+    let expected = [-0.5 * 1.075 / 2.0, -0.5 * 1.2 / 2.0, 3.0 - 0.5 * 0.05 / 2.0];
+    for (reward, expected) in rewards.iter().zip(expected) {
+        assert!((reward - expected).abs() < 1e-6, "{rewards:?}");
+    }
+    let positions = spread.positions();
+    for (position, expected) in positions.iter().zip([-0.075, 0.0, 0.2, 0.0, 1.5, 1.55]) {
+        assert!((position - expected).abs() < 1e-6, "{positions:?}");
+    }
+}
+
+#[test]
+fn overlapping_agents_pay_for_each_other_and_not_for_themselves() {
+    let mut task = task(3);
+    task.side = 4.0;
+    let positions = [0.0, 0.0, 0.1, 0.0, 0.2, 0.0];
+    let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &positions).unwrap();
+    spread.set_goals(&[0, 1, 2]).unwrap();
+    let mut rewards = [0.0; 3];
+    // The outer two are pushed out by 0.1, the middle one stays: nobody overlaps any more after the step.
+    spread.step(&[0; 3], &mut rewards).unwrap();
+    let after = spread.positions();
+    assert!(after[0] < -0.09 && (after[2] - 0.1).abs() < 1e-6 && after[4] > 0.29, "{after:?}");
+    assert!(rewards.iter().all(|r| (0.9..=1.0).contains(r)), "{rewards:?}");
+    // Driving the left one into the middle one: both pay.
+    let positions = [0.0, 0.0, 0.21, 0.0, 3.0, 0.0];
+    let mut spread = Spread::from_state(&task, &positions, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0], &positions).unwrap();
+    spread.set_goals(&[0, 1, 2]).unwrap();
+    spread.step(&[1, 0, 0], &mut rewards).unwrap();
+    let metrics = spread.metrics(&[1.25]).unwrap()[0];
+    assert!(rewards[0] < 0.1 && rewards[1] < 0.1 && rewards[2] == 1.0, "{rewards:?}");
+    assert_eq!(metrics.collisions_per_agent_step, 2.0 / 3.0);
+    assert!((metrics.reward - rewards.iter().sum::<f32>() / 3.0).abs() < 1e-6);
+    assert_eq!(metrics.cost_ratio, 1.25);
+}
+
+#[test]
+fn success_counts_any_agent_and_matched_success_only_its_own() {
+    // Two landmarks 0.2 apart with one agent between them, a third landmark alone.
+    let mut task = task(3);
+    task.side = 8.0;
+    let positions = [0.0, 0.0, 2.0, 2.0, 3.0, 3.0];
+    let landmarks = [-0.1, 0.0, 0.1, 0.0, -3.0, -3.0];
+    let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
+    spread.set_goals(&[0, 1, 2]).unwrap();
+    spread.step(&[0; 3], &mut [0.0; 3]).unwrap();
+    let metrics = spread.metrics(&[1.0]).unwrap()[0];
+    assert_eq!((metrics.success, metrics.matched_success), (2.0 / 3.0, 1.0 / 3.0));
+    assert_eq!(metrics.arrival_step, task.horizon + 1);
+}
+
+#[test]
+fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
+    for (agents, missing, arrives) in [(99, 1, false), (100, 1, true), (100, 2, false), (300, 3, true), (300, 4, false)]
+    {
+        let mut task = task(agents);
+        task.side = 2.0 * agents as f32;
+        let landmarks: Vec<f32> = (0..agents).flat_map(|k| [k as f32 - 0.5 * agents as f32, 0.0]).collect();
+        // All stand on their landmarks, but for some that are far off, and one that needs a few steps.
+        let mut positions = landmarks.clone();
+        for k in 0..missing {
+            positions[2 * (7 * k + 3) + 1] = 50.0 + k as f32;
+        }
+        positions[1] = -0.6;
+        let mut spread = Spread::from_state(&task, &positions, &vec![0.0; 2 * agents], &landmarks).unwrap();
+        spread.set_goals(&(0..agents as u32).collect::<Vec<_>>()).unwrap();
+        let mut actions = vec![0; agents];
+        actions[0] = 3;
+        let mut rewards = vec![0.0; agents];
+        let mut expected = task.horizon + 1;
+        for step in 1..=10 {
+            spread.step(&actions, &mut rewards).unwrap();
+            if arrives && expected > step && spread.positions()[1].abs() <= 0.15 {
+                expected = step;
+            }
+        }
+        assert_eq!(arrives, expected < 11);
+        let metrics = spread.metrics(&[1.0]).unwrap()[0];
+        assert_eq!(metrics.arrival_step, expected, "N = {agents}, {missing} missing");
+    }
+}
+
+#[test]
+fn an_episode_is_the_same_alone_and_in_any_batch() {
+    for (agents, episodes) in [(5, 37), (20, 17), (50, 5), (200, 14)] {
+        let task = task(agents);
+        let mut together = Spread::new(&task, streams(episodes)).unwrap();
+        let goals: Vec<u32> = (0..episodes).flat_map(|_| (0..agents as u32).rev()).collect();
+        together.set_goals(&goals).unwrap();
+        let mut alone: Vec<Spread> =
+            streams(episodes).map(|s| Spread::new(&task, std::iter::once(s)).unwrap()).collect();
+        alone.iter_mut().for_each(|spread| spread.set_goals(&goals[..agents]).unwrap());
+        let mut stream = Key::new(3, Purpose::Action, &[agents as u32]).stream();
+        let mut rewards = vec![0.0; agents * episodes as usize];
+        for _ in 0..task.horizon {
+            let actions: Vec<u8> = rewards.iter().map(|_| stream.below(5) as u8).collect();
+            together.step(&actions, &mut rewards).unwrap();
+            let positions = together.positions();
+            for (b, spread) in alone.iter_mut().enumerate() {
+                let own = b * agents..(b + 1) * agents;
+                let mut reward = vec![0.0; agents];
+                spread.step(&actions[own.clone()], &mut reward).unwrap();
+                assert_eq!(reward, rewards[own.clone()]);
+                assert_eq!(spread.positions(), positions[2 * own.start..2 * own.end]);
+            }
+        }
+        let metrics = together.metrics(&vec![1.0; episodes as usize]).unwrap();
+        for (spread, metrics) in alone.iter().zip(metrics) {
+            assert_eq!(spread.metrics(&[1.0]).unwrap(), [metrics]);
+        }
+    }
+}
+
+#[test]
+fn the_numbers_of_an_episode_are_pinned() {
+    // Any change here changes every run: raise magex_core::task::TASK_SEMANTICS with it.
+    let digest = |agents: usize, spawn: Spawn| {
+        let task = TaskConfig::simple_spread(agents, spawn);
+        let mut spread = Spread::new(&task, streams(3)).unwrap();
+        spread.set_goals(&(0..3).flat_map(|_| 0..agents as u32).collect::<Vec<_>>()).unwrap();
+        let mut stream = Key::new(3, Purpose::Action, &[]).stream();
+        let mut rewards = vec![0.0; 3 * agents];
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        for _ in 0..task.horizon {
+            let actions: Vec<u8> = rewards.iter().map(|_| stream.below(5) as u8).collect();
+            spread.step(&actions, &mut rewards).unwrap();
+            for value in spread.positions().iter().chain(&rewards) {
+                hash = (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
+            }
+        }
+        hash
+    };
+    let digests = [
+        digest(5, Spawn::Uniform),
+        digest(20, Spawn::Lines(None)),
+        digest(50, Spawn::Authors(Some(2))),
+        digest(256, Spawn::Uniform),
+    ];
+    assert_eq!(
+        digests,
+        [0x3860_8c49_4b11_e6c0, 0xf665_d42f_77b5_db8d, 0x069d_3ee1_3da6_0709, 0x2dff_ca6e_9adf_594b],
+        "{digests:#x?}"
+    );
+}
+
+#[test]
+fn wrong_calls_are_named_and_change_nothing() {
+    let task = task(5);
+    let mut spread = Spread::new(&task, streams(2)).unwrap();
+    let before = spread.positions();
+    let mut rewards = [0.0; 10];
+    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(EnvError::GoalsNotSet));
+    assert!(matches!(spread.set_goals(&[0; 9]), Err(EnvError::Length { field: "goals", found: 9, expected: 10 })));
+    let mut goals = [4; 10];
+    goals[7] = 5;
+    assert!(matches!(spread.set_goals(&goals), Err(EnvError::Goal { place: 7, goal: 5, landmarks: 5 })));
+    spread.set_goals(&[0; 10]).unwrap();
+    let mut actions = [1; 10];
+    actions[3] = 5;
+    assert_eq!(spread.step(&actions, &mut rewards), Err(EnvError::Action { place: 3, action: 5 }));
+    assert!(spread.step(&[0; 9], &mut rewards).is_err());
+    assert!(spread.step(&[0; 10], &mut rewards[..9]).is_err());
+    assert!(spread.write_positions(&mut [0.0; 19]).is_err());
+    assert!(spread.metrics(&[1.0]).is_err());
+    assert_eq!((spread.positions(), spread.steps()), (before, 0));
+    for _ in 0..task.horizon {
+        spread.step(&[0; 10], &mut rewards).unwrap();
+    }
+    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(EnvError::EpisodeOver { horizon: 60 }));
+    let bad = Spread::from_state(&task, &[f32::NAN; 10], &[0.0; 10], &[0.0; 10]);
+    assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 0, .. })));
+    let mut task = task;
+    task.side = -1.0;
+    assert!(Spread::new(&task, streams(1)).unwrap_err().to_string().contains("task.side"));
+}
+
+#[test]
+fn a_batch_of_nothing_is_fine() {
+    let mut spread = Spread::new(&task(5), streams(0)).unwrap();
+    spread.set_goals(&[]).unwrap();
+    spread.step(&[], &mut []).unwrap();
+    assert_eq!((spread.episodes(), spread.positions().len()), (0, 0));
+}

@@ -1,0 +1,115 @@
+//! The yardstick: a controller of one line, given the exact assignment, solves every size of the paper well inside the
+//! horizon.
+
+// Helpers of tests; the lint's exception covers test functions only.
+#![allow(clippy::unwrap_used)]
+
+use magex_core::rng::{Key, Purpose};
+use magex_core::task::{Spawn, TaskConfig};
+use magex_core::trajectory::EpisodeMetrics;
+use magex_env::Spread;
+use magex_env::scripted::scripted_actions;
+
+/// Exact assignment by shortest augmenting paths; `cost` is [n, n], the result maps rows to columns.
+fn assign(cost: &[f64], n: usize) -> Vec<u32> {
+    // One-based potentials and matching with column 0 as the root of each search.
+    let (mut u, mut v) = (vec![0.0; n + 1], vec![0.0; n + 1]);
+    let (mut row_of, mut way) = (vec![0; n + 1], vec![0; n + 1]);
+    for row in 1..=n {
+        row_of[0] = row;
+        let mut column = 0;
+        let (mut slack, mut used) = (vec![f64::INFINITY; n + 1], vec![false; n + 1]);
+        while row_of[column] != 0 {
+            used[column] = true;
+            let (i, mut delta, mut next) = (row_of[column], f64::INFINITY, 0);
+            for j in (1..=n).filter(|&j| !used[j]) {
+                let reduced = cost[(i - 1) * n + j - 1] - u[i] - v[j];
+                if reduced < slack[j] {
+                    (slack[j], way[j]) = (reduced, column);
+                }
+                if slack[j] < delta {
+                    (delta, next) = (slack[j], j);
+                }
+            }
+            for j in 0..=n {
+                if used[j] {
+                    u[row_of[j]] += delta;
+                    v[j] -= delta;
+                } else {
+                    slack[j] -= delta;
+                }
+            }
+            column = next;
+        }
+        while column != 0 {
+            row_of[column] = row_of[way[column]];
+            column = way[column];
+        }
+    }
+    let mut columns = vec![0; n];
+    (1..=n).for_each(|j| columns[row_of[j] - 1] = j as u32 - 1);
+    columns
+}
+
+fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> {
+    let worlds = positions.chunks_exact(2 * agents).zip(landmarks.chunks_exact(2 * agents));
+    let solve = |(agents_at, landmarks_at): (&[f32], &[f32])| {
+        let distance = |a: &[f32], b: &[f32]| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]));
+        let rows = agents_at.chunks_exact(2);
+        let cost: Vec<f64> = rows.flat_map(|a| landmarks_at.chunks_exact(2).map(move |b| distance(a, b))).collect();
+        assign(&cost, agents)
+    };
+    worlds.flat_map(solve).collect()
+}
+
+fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
+    let task = TaskConfig::simple_spread(agents, spawn);
+    let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
+    let mut spread = Spread::new(&task, streams).unwrap();
+    let landmarks = spread.landmarks().to_vec();
+    let goals = exact_goals(&spread.positions(), &landmarks, agents);
+    spread.set_goals(&goals).unwrap();
+    let (mut positions, mut velocities) = (spread.positions(), spread.velocities());
+    let mut actions = vec![0; goals.len()];
+    let mut rewards = vec![0.0; goals.len()];
+    for _ in 0..task.horizon {
+        spread.write_positions(&mut positions).unwrap();
+        spread.write_velocities(&mut velocities).unwrap();
+        scripted_actions(&positions, &velocities, &landmarks, &goals, agents, &mut actions).unwrap();
+        spread.step(&actions, &mut rewards).unwrap();
+    }
+    spread.metrics(&vec![1.0; episodes as usize]).unwrap()
+}
+
+fn check(agents: usize, spawn: Spawn, at_least: f32, arrival_below: f32) {
+    let metrics = play(agents, spawn, 400);
+    let mean = |value: fn(&EpisodeMetrics) -> f32| metrics.iter().map(value).sum::<f32>() / metrics.len() as f32;
+    let (success, arrival) = (mean(|m| m.success), mean(|m| m.arrival_step as f32));
+    assert!(success >= at_least, "{agents} {spawn}: success {success}");
+    assert!(arrival < arrival_below, "{agents} {spawn}: arrival {arrival}");
+}
+
+#[test]
+fn uniform_spawns_are_solved() {
+    check(5, Spawn::Uniform, 0.999, 20.0);
+    check(20, Spawn::Uniform, 0.999, 35.0);
+    check(50, Spawn::Uniform, 0.999, 45.0);
+}
+
+#[test]
+fn the_lines_are_solved_layout_by_layout() {
+    for agents in [20, 50] {
+        for layout in 0..4 {
+            check(agents, Spawn::Lines(Some(layout)), 0.99, 75.0);
+            check(agents, Spawn::Authors(Some(layout)), 0.99, 75.0);
+        }
+    }
+    check(5, Spawn::Lines(None), 0.99, 40.0);
+}
+
+#[test]
+fn larger_sizes_are_solved() {
+    check(100, Spawn::Uniform, 0.999, 60.0);
+    let metrics = play(300, Spawn::Uniform, 4);
+    assert!(metrics.iter().all(|m| m.success >= 0.999), "{metrics:?}");
+}

@@ -1,0 +1,122 @@
+//! Categorical action distributions, evaluated row by row. Actors (to act) and learner (to differentiate) share this
+//! code, so equal logits give equal log-probabilities to the bit.
+
+use crate::simd::{LANES, load};
+use magex_core::rng::Stream;
+use wide::f32x16;
+
+/// Components of an action; each is an independent categorical over its own logits, which stand side by side in a row.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ActionHeads {
+    sizes: Vec<usize>,
+}
+
+impl ActionHeads {
+    /// From the number of choices of each component (each between 1 and 16).
+    pub fn new(sizes: Vec<usize>) -> Option<Self> {
+        (!sizes.is_empty() && sizes.iter().all(|s| (1..=LANES).contains(s))).then_some(Self { sizes })
+    }
+
+    /// H: components.
+    pub fn count(&self) -> usize {
+        self.sizes.len()
+    }
+
+    /// A: logits of a row.
+    pub fn logits(&self) -> usize {
+        self.sizes.iter().sum()
+    }
+
+    /// Choices of each component.
+    pub fn sizes(&self) -> &[usize] {
+        &self.sizes
+    }
+
+    /// Log-probabilities of every choice, component by component.
+    #[inline]
+    pub fn log_softmax(&self, logits: &[f32], out: &mut [f32]) {
+        let mut at = 0;
+        for &size in &self.sizes {
+            log_softmax(&logits[at..at + size], &mut out[at..at + size]);
+            at += size;
+        }
+    }
+
+    /// Chooses an action for one row; returns its log-probability. `stream` = None takes the most likely choices (the
+    /// first of equals).
+    pub fn choose(&self, logits: &[f32], mut stream: Option<&mut Stream>, action: &mut [u8]) -> f32 {
+        let mut log_probs = [0.0f32; LANES];
+        let (mut at, mut total) = (0, 0.0);
+        for (&size, slot) in self.sizes.iter().zip(action) {
+            let log_probs = &mut log_probs[..size];
+            log_softmax(&logits[at..at + size], log_probs);
+            let pick = match &mut stream {
+                None => log_probs.iter().enumerate().fold(0, |best, (i, &x)| if x > log_probs[best] { i } else { best }),
+                Some(stream) => {
+                    let u = stream.uniform32();
+                    let mut sum = 0.0;
+                    let mut pick = size - 1;
+                    for (i, x) in log_probs.iter().enumerate() {
+                        sum += libm::expf(*x);
+                        if u < sum {
+                            pick = i;
+                            break;
+                        }
+                    }
+                    pick
+                }
+            };
+            total += log_probs[pick];
+            *slot = pick as u8;
+            at += size;
+        }
+        total
+    }
+}
+
+/// x − max − ln Σ exp(x − max) for up to sixteen numbers.
+#[inline]
+fn log_softmax(logits: &[f32], out: &mut [f32]) {
+    let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let shifted = load(logits) - f32x16::splat(max);
+    let exps = shifted.exp().to_array();
+    let sum: f32 = exps[..logits.len()].iter().sum();
+    let log_sum = libm::logf(sum);
+    for (o, x) in out.iter_mut().zip(logits) {
+        *o = (x - max) - log_sum;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::rng::{Key, Purpose};
+
+    #[test]
+    fn probabilities_sum_to_one_and_large_logits_are_safe() {
+        let heads = ActionHeads::new(vec![5]).unwrap();
+        for logits in [[0.0, 1.0, 2.0, 3.0, 4.0], [1000.0, 0.0, 0.0, 0.0, -1000.0], [-50.0; 5]] {
+            let mut out = [0.0; 5];
+            heads.log_softmax(&logits, &mut out);
+            let sum: f32 = out.iter().map(|x| x.exp()).sum();
+            assert!((sum - 1.0).abs() < 1e-5, "{sum}");
+        }
+    }
+
+    #[test]
+    fn samples_follow_the_distribution_and_greedy_takes_the_mode() {
+        let heads = ActionHeads::new(vec![3, 2]).unwrap();
+        let logits = [0.0, (3.0f32).ln(), 0.0, 0.0, (4.0f32).ln()];
+        let mut stream = Key::new(1, Purpose::Action, &[]).stream();
+        let (mut action, mut seen) = ([0u8; 2], [0u32; 2]);
+        for _ in 0..10_000 {
+            heads.choose(&logits, Some(&mut stream), &mut action);
+            seen[0] += u32::from(action[0] == 1);
+            seen[1] += u32::from(action[1] == 1);
+        }
+        assert!((5800..6200).contains(&seen[0]) && (7800..8200).contains(&seen[1]), "{seen:?}");
+        let log_prob = heads.choose(&logits, None, &mut action);
+        assert_eq!(action, [1, 1]);
+        assert!((log_prob - (0.6f32 * 0.8).ln()).abs() < 1e-5);
+    }
+}

@@ -1,0 +1,130 @@
+//! The action executor (paper, section 4.2): actor and critic networks behind one small trait.
+//!
+//! | kind | team features E_a | goal features | memory |
+//! |---|---|---|---|
+//! | `magex` | GCN + l_g hard Gumbel-softmax graph blocks, the reading that we recommend | relative | GRU |
+//! | `magex-literal` | the paper's formulas to the letter: no self path, absolute positions | absolute | GRU |
+//! | `attention` | multi-head attention over all agents (ablation "-Atten") | relative | GRU |
+//! | `mlp` | one layer on the concatenated observations (ablation "-MLP"); fixed team size | relative | GRU |
+//! | `local` | sum over the k nearest neighbours | relative | none |
+
+mod local;
+mod team;
+
+use crate::features::{FeatureSpec, Features};
+use crate::matmul::Activation;
+use crate::ops::{GraphNoise, linear};
+use crate::params::{ParamError, Source, Start};
+use candle_core::{Device, Result as CandleResult, Tensor};
+use magex_core::config::{ExecutorConfig, ExecutorKind};
+use magex_core::task::TaskConfig;
+
+pub use local::LocalNet;
+pub use team::TeamNet;
+
+/// What a network sees: L steps of C sequences of N agents, rows ordered [L, C, N].
+#[derive(Debug)]
+pub struct Input<'a> {
+    /// L: consecutive joint steps.
+    pub steps: usize,
+    /// C: episodes side by side.
+    pub sequences: usize,
+    /// N: agents.
+    pub agents: usize,
+    /// Features of the L·C·N rows.
+    pub features: &'a Features,
+    /// [C·N, H] state of the memory that enters the first step; empty for networks without memory.
+    pub hidden: Vec<f32>,
+    /// Gumbel noise: one key per joint state, L·C of them.
+    pub noise: GraphNoise,
+}
+
+/// What a network answers.
+#[derive(Debug)]
+pub struct Output {
+    /// [L·C·N, O] action logits or values.
+    pub out: Tensor,
+    /// [L, C·N, H] states of the memory after each step; `None` for networks without memory.
+    pub states: Option<Tensor>,
+}
+
+/// An executor network: actor (O = number of action logits) or critic (O = 1).
+pub trait Network: Send + Sync {
+    /// One pass over a batch of sequences.
+    fn forward(&self, input: &Input<'_>) -> CandleResult<Output>;
+
+    /// H: width of the memory, 0 for none.
+    fn memory(&self) -> usize;
+}
+
+/// What features the executor of a run wants.
+pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
+    FeatureSpec {
+        dims: task.dims(),
+        targets: 1,
+        half_side: task.side / 2.0,
+        relative_goal: config.kind != ExecutorKind::MagexLiteral,
+        neighbours: if config.kind == ExecutorKind::Local { config.neighbours } else { 0 },
+    }
+}
+
+/// H of the executor's memory, without building it.
+pub fn memory(config: &ExecutorConfig) -> usize {
+    if config.kind == ExecutorKind::Local { 0 } else { config.feature_size }
+}
+
+/// Builds an actor or critic with `outputs` outputs; `head_gain` is the orthogonal gain of the last layer
+/// (0.01 for actors, 1 for critics). `agents` matters to `mlp` only.
+pub fn build(
+    config: &ExecutorConfig,
+    spec: &FeatureSpec,
+    agents: usize,
+    outputs: usize,
+    head_gain: f64,
+    source: &mut Source<'_>,
+) -> Result<Box<dyn Network>, ParamError> {
+    Ok(match config.kind {
+        ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, source)?),
+        _ => Box::new(TeamNet::build(config, spec, agents, outputs, head_gain, source)?),
+    })
+}
+
+/// A fully connected layer.
+pub(crate) struct Layer {
+    w: Tensor,
+    b: Tensor,
+    act: Activation,
+}
+
+impl Layer {
+    pub(crate) fn build(
+        source: &mut Source<'_>,
+        name: &str,
+        (inputs, outputs): (usize, usize),
+        act: Activation,
+        gain: f64,
+    ) -> Result<Self, ParamError> {
+        Ok(Self {
+            w: source.get(&format!("{name}.weight"), &[inputs, outputs], Start::Orthogonal(gain))?,
+            b: source.get(&format!("{name}.bias"), &[outputs], Start::Constant(0.0))?,
+            act,
+        })
+    }
+
+    pub(crate) fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
+        linear(x, &self.w, &self.b, self.act, false)
+    }
+
+    /// For inputs that need no gradient (features).
+    pub(crate) fn forward_constant(&self, x: &Tensor) -> CandleResult<Tensor> {
+        linear(x, &self.w, &self.b, self.act, true)
+    }
+}
+
+/// Gain of layers followed by ReLU.
+pub(crate) const RELU_GAIN: f64 = std::f64::consts::SQRT_2;
+
+/// A constant tensor [rows, width] from features.
+pub(crate) fn constant(numbers: &[f32], width: usize) -> CandleResult<Tensor> {
+    Tensor::from_slice(numbers, (numbers.len() / width, width), &Device::Cpu)
+}

@@ -1,0 +1,221 @@
+//! The paper's executor: Subgraph Extractor, Goal Encoder, State Extractor, Action Generator; and its ablations.
+
+use super::{Input, Layer, Network, Output, RELU_GAIN, constant};
+use crate::features::FeatureSpec;
+use crate::matmul::Activation;
+use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others};
+use crate::params::{ParamError, Source, Start};
+use candle_core::{D, DType, Device, Result as CandleResult, Tensor};
+use magex_core::config::{ExecutorConfig, ExecutorKind};
+
+/// Heads and width of a head of the attention ablation (authors' code: 4 × 16).
+const HEADS: usize = 4;
+const HEAD_WIDTH: usize = 16;
+
+/// Where an agent's team feature E_a comes from.
+enum Team {
+    /// Observation Encoder with a fully connected GCN, then hard Gumbel-softmax blocks.
+    Graph { encode: Layer, blocks: Vec<Block>, literal: bool },
+    /// Ablation -Atten.
+    Attention { qkv: Layer, out: Layer },
+    /// Ablation -MLP.
+    Concat { mix: Layer },
+}
+
+struct Block {
+    /// h → [u | v | z | self].
+    project: Layer,
+    /// Pair offsets → P; `None` in the literal reading.
+    relative: Option<Tensor>,
+    score: Tensor,
+    shape: GraphBlock,
+}
+
+struct Norm {
+    scale: Tensor,
+    shift: Tensor,
+}
+
+impl Norm {
+    fn build(source: &mut Source<'_>, name: &str, width: usize) -> Result<Self, ParamError> {
+        Ok(Self {
+            scale: source.get(&format!("{name}.scale"), &[width], Start::Constant(1.0))?,
+            shift: source.get(&format!("{name}.shift"), &[width], Start::Constant(0.0))?,
+        })
+    }
+
+    fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
+        layer_norm(x, &self.scale, &self.shift)
+    }
+}
+
+/// Paper, figure 2. F = feature size.
+pub struct TeamNet {
+    observe: Layer,
+    team: Team,
+    goal: Layer,
+    fuse_norm: Option<Norm>,
+    state: Layer,
+    gates: Layer,
+    recurrent: (Tensor, Tensor),
+    out_norm: Norm,
+    head: Layer,
+    spec: FeatureSpec,
+    width: usize,
+    pair_hidden: usize,
+}
+
+impl TeamNet {
+    /// Builds the kind that the configuration names.
+    pub fn build(
+        config: &ExecutorConfig,
+        spec: &FeatureSpec,
+        agents: usize,
+        outputs: usize,
+        head_gain: f64,
+        source: &mut Source<'_>,
+    ) -> Result<Self, ParamError> {
+        let f = config.feature_size;
+        let p = config.pair_hidden;
+        let relu = Activation::Relu;
+        let observe = Layer::build(source, "f_o", (spec.node_width(), f), relu, RELU_GAIN)?;
+        let team = match config.kind {
+            ExecutorKind::Attention => {
+                let inner = HEADS * HEAD_WIDTH;
+                Team::Attention {
+                    qkv: Layer::build(source, "attention.qkv", (f, 3 * inner), Activation::Identity, 1.0)?,
+                    out: Layer::build(source, "attention.out", (inner, f), Activation::Identity, 1.0)?,
+                }
+            }
+            ExecutorKind::Mlp => {
+                Team::Concat { mix: Layer::build(source, "concat", (agents * f, f), relu, RELU_GAIN)? }
+            }
+            _ => {
+                let literal = config.kind == ExecutorKind::MagexLiteral;
+                let inputs = if literal { f } else { 2 * f };
+                let encode = Layer::build(source, "gcn", (inputs, f), relu, RELU_GAIN)?;
+                let mut blocks = Vec::new();
+                for b in 0..config.graph_blocks {
+                    let name = format!("block{b}");
+                    blocks.push(Block {
+                        project: Layer::build(
+                            source,
+                            &format!("{name}.project"),
+                            (f, 2 * p + 2 * f),
+                            Activation::Identity,
+                            1.0,
+                        )?,
+                        relative: if literal {
+                            None
+                        } else {
+                            Some(source.get(
+                                &format!("{name}.relative"),
+                                &[2 * spec.dims, p],
+                                Start::Orthogonal(1.0),
+                            )?)
+                        },
+                        score: source.get(&format!("{name}.score"), &[p + 1], Start::Orthogonal(0.5))?,
+                        shape: GraphBlock {
+                            agents: 0,
+                            pair_hidden: p,
+                            width: f,
+                            block: b as u32,
+                            self_path: !literal,
+                            temperature: config.temperature,
+                        },
+                    });
+                }
+                Team::Graph { encode, blocks, literal }
+            }
+        };
+        Ok(Self {
+            observe,
+            team,
+            goal: Layer::build(source, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?,
+            fuse_norm: if config.feature_norm { Some(Norm::build(source, "f_state.norm", 2 * f)?) } else { None },
+            state: Layer::build(source, "f_state", (2 * f, f), relu, RELU_GAIN)?,
+            gates: Layer::build(source, "gru.input", (f, 3 * f), Activation::Identity, 1.0)?,
+            recurrent: (
+                source.get("gru.weight", &[f, 3 * f], Start::Orthogonal(1.0))?,
+                source.get("gru.bias", &[3 * f], Start::Constant(0.0))?,
+            ),
+            out_norm: Norm::build(source, "gru.norm", f)?,
+            head: Layer::build(source, "head", (f, outputs), Activation::Identity, head_gain)?,
+            spec: *spec,
+            width: f,
+            pair_hidden: p,
+        })
+    }
+
+    /// E_a [R, F].
+    fn team_features(&self, input: &Input<'_>) -> CandleResult<Tensor> {
+        let features = input.features;
+        let n = input.agents;
+        let x = self.observe.forward_constant(&constant(&features.nodes, self.spec.node_width())?)?;
+        match &self.team {
+            Team::Graph { encode, blocks, literal } => {
+                let others = mean_of_others(&x, n)?;
+                let mut h = if *literal {
+                    // Mean over all agents, the agent itself included: every node gets the same feature.
+                    let share = 1.0 / n as f64;
+                    encode.forward(&((&x * share)? + (others * (1.0 - share))?)?)?
+                } else {
+                    encode.forward(&Tensor::cat(&[&x, &others], 1)?)?
+                };
+                let pairs = constant(&features.pairs, 2 * self.spec.dims)?;
+                let zeros = Tensor::zeros(self.pair_hidden, DType::F32, &Device::Cpu)?;
+                for block in blocks {
+                    let projected = block.project.forward(&h)?;
+                    let relative = match &block.relative {
+                        Some(w) => crate::ops::linear(&pairs, w, &zeros, Activation::Identity, true)?,
+                        None => Tensor::zeros((pairs.dim(0)?, self.pair_hidden), DType::F32, &Device::Cpu)?,
+                    };
+                    let shape = GraphBlock { agents: n, ..block.shape.clone() };
+                    h = graph_block(&projected, &relative, &block.score, shape, input.noise.clone())?;
+                }
+                Ok(h)
+            }
+            Team::Attention { qkv, out } => {
+                let states = x.dim(0)? / n;
+                let inner = HEADS * HEAD_WIDTH;
+                let qkv = qkv.forward(&x)?.reshape((states, n, 3, HEADS, HEAD_WIDTH))?;
+                let part = |i: usize| -> CandleResult<Tensor> {
+                    qkv.narrow(2, i, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous()
+                };
+                let (q, k, v) = (part(0)?, part(1)?, part(2)?);
+                let scale = 1.0 / (HEAD_WIDTH as f64).sqrt();
+                let weights = (q.matmul(&k.transpose(2, 3)?.contiguous()?)? * scale)?;
+                let mixed = candle_nn::ops::softmax(&weights, D::Minus1)?.matmul(&v)?;
+                out.forward(&mixed.transpose(1, 2)?.contiguous()?.reshape((states * n, inner))?)
+            }
+            Team::Concat { mix } => {
+                let states = x.dim(0)? / n;
+                let team = mix.forward(&x.reshape((states, n * self.width))?)?;
+                team.unsqueeze(1)?.broadcast_as((states, n, self.width))?.contiguous()?.reshape((states * n, self.width))
+            }
+        }
+    }
+}
+
+impl Network for TeamNet {
+    fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
+        let sequences = input.sequences * input.agents;
+        let team = self.team_features(input)?;
+        let goal = self.goal.forward_constant(&constant(&input.features.goals, self.spec.goal_width())?)?;
+        let mut fused = Tensor::cat(&[&goal, &team], 1)?;
+        if let Some(norm) = &self.fuse_norm {
+            fused = norm.forward(&fused)?;
+        }
+        let gates = self.gates.forward(&self.state.forward(&fused)?)?;
+        let gates = gates.reshape((input.steps, sequences, 3 * self.width))?;
+        let (w, b) = &self.recurrent;
+        let states = gru(&gates, w, b, input.hidden.clone())?;
+        let flat = states.reshape((input.steps * sequences, self.width))?;
+        let out = self.head.forward(&self.out_norm.forward(&flat)?)?;
+        Ok(Output { out, states: Some(states) })
+    }
+
+    fn memory(&self) -> usize {
+        self.width
+    }
+}

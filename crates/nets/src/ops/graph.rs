@@ -1,0 +1,369 @@
+use super::{numbers, slice, with_numbers};
+use crate::simd::{LANES, load, sigmoid, store, sum};
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use std::sync::Arc;
+use wide::f32x16;
+
+/// Where the Gumbel noise of a graph block comes from.
+#[derive(Debug, Clone)]
+pub enum GraphNoise {
+    /// No noise: an edge is there if its logit is positive (evaluation, critic).
+    Off,
+    /// One key per joint state: the noise of a pair is a pure function of (key, block, i, j), so that the update replays
+    /// exactly the graph of the rollout and the first importance ratio is exactly 1.
+    Keyed(Arc<Vec<u64>>),
+}
+
+/// One block of the Graph Encoder (paper, eq. 6 and 7), all pairs of a joint state in one operation.
+#[derive(Debug, Clone)]
+pub struct GraphBlock {
+    /// N: agents of a joint state.
+    pub agents: usize,
+    /// P: hidden units of the pair network f_g.
+    pub pair_hidden: usize,
+    /// F: features of a message.
+    pub width: usize,
+    /// Index of the block: the same key gives other noise in another block.
+    pub block: u32,
+    /// Whether the block's own features stay in the sum (they should; the literal reading of the paper drops them).
+    pub self_path: bool,
+    /// τ of the straight-through gradient.
+    pub temperature: f32,
+}
+
+/// y [S·N, F] = relu(self_i + Σ_j a_ij z_j / max(1, Σ_j a_ij)), with hard edges
+/// a_ij = 1[w2 · relu(u_i + v_j) + b2 + noise_ij > 0], j ≠ i, and the straight-through gradient of the two-channel
+/// Gumbel softmax (the difference of two Gumbels is logistic).
+///
+/// `features` [S·N, 2P + 2F] holds u, v, z and self side by side; `relative` [S·N, P] is subtracted from u and added to v,
+/// which makes the pair network see positions relative to each other only; `score` [P + 1] is w2 and b2.
+pub fn graph_block(
+    features: &Tensor,
+    relative: &Tensor,
+    score: &Tensor,
+    block: GraphBlock,
+    noise: GraphNoise,
+) -> Result<Tensor> {
+    features.contiguous()?.apply_op3(relative, score, Op { block, noise })
+}
+
+struct Op {
+    block: GraphBlock,
+    noise: GraphNoise,
+}
+
+/// Working memory of one joint state. `padded` is N rounded up to whole vectors.
+struct Scratch {
+    padded: usize,
+    /// [N, P] u_i − q_i.
+    sender: Vec<f32>,
+    /// [P, padded] v_j + q_j, transposed so that one vector holds sixteen neighbours.
+    receiver: Vec<f32>,
+    /// [padded] logits plus noise of the current row.
+    logits: Vec<f32>,
+}
+
+impl Op {
+    fn scratch(&self) -> Scratch {
+        let padded = self.block.agents.div_ceil(LANES) * LANES;
+        let p = self.block.pair_hidden;
+        Scratch {
+            padded,
+            sender: vec![0.0; self.block.agents * p],
+            receiver: vec![0.0; p * padded],
+            logits: vec![0.0; padded],
+        }
+    }
+
+    fn columns(&self) -> usize {
+        2 * self.block.pair_hidden + 2 * self.block.width
+    }
+
+    fn load_pairs(&self, features: &[f32], relative: &[f32], scratch: &mut Scratch) {
+        let (n, p, columns) = (self.block.agents, self.block.pair_hidden, self.columns());
+        for i in 0..n {
+            let (row, q) = (&features[i * columns..], &relative[i * p..(i + 1) * p]);
+            for k in 0..p {
+                scratch.sender[i * p + k] = row[k] - q[k];
+                scratch.receiver[k * scratch.padded + i] = row[p + k] + q[k];
+            }
+        }
+    }
+
+    /// Logits plus noise of agent i towards everybody, sixteen neighbours at a time.
+    #[inline(always)]
+    fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &mut Scratch) {
+        let (n, p, padded) = (self.block.agents, self.block.pair_hidden, scratch.padded);
+        let sender = &scratch.sender[i * p..(i + 1) * p];
+        let bias = f32x16::splat(score[p]);
+        for v in (0..padded).step_by(LANES) {
+            let mut acc = bias;
+            for k in 0..p {
+                let hidden = f32x16::splat(sender[k]) + load(&scratch.receiver[k * padded + v..]);
+                acc = f32x16::splat(score[k]).mul_add(hidden.fast_max(f32x16::ZERO), acc);
+            }
+            if let GraphNoise::Keyed(keys) = &self.noise {
+                let counter = (self.block.block << 27).wrapping_add((i * n + v) as u32);
+                acc += logistic(keys[state], counter);
+            }
+            store(acc, &mut scratch.logits[v..]);
+        }
+    }
+
+    /// Calls `f` for every present edge i → j, in ascending j. Returns the degree.
+    #[inline(always)]
+    fn edges(&self, i: usize, scratch: &Scratch, mut f: impl FnMut(usize)) -> usize {
+        let n = self.block.agents;
+        let mut degree = 0;
+        for v in (0..scratch.padded).step_by(LANES) {
+            let mut mask = load(&scratch.logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
+            if n - v < LANES {
+                mask &= (1 << (n - v)) - 1;
+            }
+            if (v..v + LANES).contains(&i) {
+                mask &= !(1 << (i - v));
+            }
+            degree += mask.count_ones() as usize;
+            while mask != 0 {
+                f(v + mask.trailing_zeros() as usize);
+                mask &= mask - 1;
+            }
+        }
+        degree
+    }
+
+    /// Mean message of agent i, and its divisor max(1, degree).
+    #[inline(always)]
+    fn message(&self, i: usize, features: &[f32], scratch: &Scratch, message: &mut [f32]) -> usize {
+        let (columns, width) = (self.columns(), self.block.width);
+        let z0 = 2 * self.block.pair_hidden;
+        message.fill(0.0);
+        let degree = if width == 2 * LANES {
+            // The usual width, held in registers: the same sums in the same order as below.
+            let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
+            let degree = self.edges(i, scratch, |j| {
+                let z = &features[j * columns + z0..];
+                a += load(z);
+                b += load(&z[LANES..]);
+            });
+            store(a, message);
+            store(b, &mut message[LANES..]);
+            degree
+        } else {
+            self.edges(i, scratch, |j| {
+                for (m, z) in message.iter_mut().zip(&features[j * columns + z0..]) {
+                    *m += z;
+                }
+            })
+        };
+        let inverse = 1.0 / degree.max(1) as f32;
+        for m in message.iter_mut() {
+            *m *= inverse;
+        }
+        degree
+    }
+
+    fn forward(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
+        let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
+        let states = features.len() / (n * columns);
+        let mut y = vec![0.0; states * n * width];
+        let mut scratch = self.scratch();
+        let mut message = vec![0.0; width];
+        for s in 0..states {
+            let features = &features[s * n * columns..(s + 1) * n * columns];
+            self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
+            for i in 0..n {
+                self.row_logits(s, i, score, &mut scratch);
+                self.message(i, features, &scratch, &mut message);
+                let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
+                let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
+                for k in 0..width {
+                    let own = if self.block.self_path { own[k] } else { 0.0 };
+                    out[k] = (own + message[k]).max(0.0);
+                }
+            }
+        }
+        y
+    }
+
+    fn backward(&self, features: &[f32], relative: &[f32], score: &[f32], y: &[f32], dy: &[f32]) -> Gradients {
+        let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
+        let states = features.len() / (n * columns);
+        let mut scratch = self.scratch();
+        let padded = scratch.padded;
+        let mut out = Gradients {
+            features: vec![0.0; features.len()],
+            relative: vec![0.0; relative.len()],
+            score: vec![0.0; p + 1],
+        };
+        let mut d_score = vec![f32x16::ZERO; p + 1];
+        let (mut z, mut d_z) = (vec![0.0; width * padded], vec![0.0; n * width]);
+        let mut d_receiver = vec![f32x16::ZERO; p * padded / LANES];
+        let (mut message, mut g) = (vec![0.0; width], vec![0.0; width]);
+        let inverse_temperature = f32x16::splat(1.0 / self.block.temperature);
+        let mut d_sender = vec![f32x16::ZERO; p];
+        for s in 0..states {
+            let features = &features[s * n * columns..(s + 1) * n * columns];
+            let d_features = &mut out.features[s * n * columns..(s + 1) * n * columns];
+            self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
+            for j in 0..n {
+                for k in 0..width {
+                    z[k * padded + j] = features[j * columns + 2 * p + k];
+                }
+            }
+            d_receiver.fill(f32x16::ZERO);
+            d_z.fill(0.0);
+            for i in 0..n {
+                self.row_logits(s, i, score, &mut scratch);
+                let degree = self.message(i, features, &scratch, &mut message);
+                let inverse = 1.0 / degree.max(1) as f32;
+                let at = (s * n + i) * width;
+                let mut through_mean = 0.0;
+                for k in 0..width {
+                    let d = if y[at + k] > 0.0 { dy[at + k] } else { 0.0 };
+                    if self.block.self_path {
+                        d_features[i * columns + 2 * p + width + k] = d;
+                    }
+                    g[k] = d * inverse;
+                    through_mean += g[k] * message[k];
+                }
+                self.edges(i, &scratch, |j| {
+                    for (d, g) in d_z[j * width..(j + 1) * width].iter_mut().zip(&g) {
+                        *d += g;
+                    }
+                });
+                if degree == 0 {
+                    through_mean = 0.0;
+                }
+                d_sender.fill(f32x16::ZERO);
+                for v in (0..padded).step_by(LANES) {
+                    // d a_ij = g_i · (z_j − mean message), then through σ'((logit + noise) / τ).
+                    let mut d_edge = f32x16::splat(-through_mean);
+                    for k in 0..width {
+                        d_edge = f32x16::splat(g[k]).mul_add(load(&z[k * padded + v..]), d_edge);
+                    }
+                    let soft = sigmoid(load(&scratch.logits[v..]) * inverse_temperature);
+                    let slope = soft * (f32x16::ONE - soft) * inverse_temperature;
+                    let d_logit = (d_edge * slope) & present(i, v, n);
+                    d_score[p] += d_logit;
+                    for k in 0..p {
+                        let hidden = f32x16::splat(scratch.sender[i * p + k]) + load(&scratch.receiver[k * padded + v..]);
+                        let on = hidden.simd_gt(f32x16::ZERO);
+                        d_score[k] = d_logit.mul_add(hidden & on, d_score[k]);
+                        let d_hidden = (d_logit * f32x16::splat(score[k])) & on;
+                        d_sender[k] += d_hidden;
+                        d_receiver[(k * padded + v) / LANES] += d_hidden;
+                    }
+                }
+                for k in 0..p {
+                    let d = sum(d_sender[k]);
+                    d_features[i * columns + k] = d;
+                    out.relative[(s * n + i) * p + k] = -d;
+                }
+            }
+            for k in 0..p {
+                for v in (0..padded).step_by(LANES) {
+                    for (lane, d) in d_receiver[(k * padded + v) / LANES].to_array().into_iter().enumerate() {
+                        let j = v + lane;
+                        if j < n {
+                            d_features[j * columns + p + k] = d;
+                            out.relative[(s * n + j) * p + k] += d;
+                        }
+                    }
+                }
+            }
+            for j in 0..n {
+                d_features[j * columns + 2 * p..j * columns + 2 * p + width]
+                    .copy_from_slice(&d_z[j * width..(j + 1) * width]);
+            }
+        }
+        for (d, v) in out.score.iter_mut().zip(d_score) {
+            *d = sum(v);
+        }
+        out
+    }
+}
+
+struct Gradients {
+    features: Vec<f32>,
+    relative: Vec<f32>,
+    score: Vec<f32>,
+}
+
+/// All-ones lanes for neighbours that exist and are not agent i itself.
+#[inline(always)]
+fn present(i: usize, v: usize, n: usize) -> f32x16 {
+    let mut lanes = [f32::from_bits(u32::MAX); LANES];
+    for (lane, slot) in lanes.iter_mut().enumerate() {
+        if v + lane >= n || v + lane == i {
+            *slot = 0.0;
+        }
+    }
+    f32x16::new(lanes)
+}
+
+/// Sixteen logistic numbers for counters `counter..counter + 16`.
+#[inline(always)]
+fn logistic(key: u64, counter: u32) -> f32x16 {
+    let mut uniform = [0.0f32; LANES];
+    for (lane, slot) in uniform.iter_mut().enumerate() {
+        // 23 bits and a half: never 0 and never 1.
+        let bits = magex_core::rng::mix(key, counter.wrapping_add(lane as u32)) >> 9;
+        *slot = (bits as f32 + 0.5) * (1.0 / 8_388_608.0);
+    }
+    let u = f32x16::new(uniform);
+    u.ln() - (f32x16::ONE - u).ln()
+}
+
+impl CustomOp3 for Op {
+    fn name(&self) -> &'static str {
+        "graph-block"
+    }
+
+    fn cpu_fwd(
+        &self,
+        features: &CpuStorage,
+        lf: &Layout,
+        relative: &CpuStorage,
+        lr: &Layout,
+        score: &CpuStorage,
+        ls: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (rows, columns) = lf.shape().dims2()?;
+        let (n, p) = (self.block.agents, self.block.pair_hidden);
+        if n == 0 || rows % n != 0 || columns != self.columns() {
+            bail!("graph block: features [{rows}, {columns}] do not fit {n} agents, {p} pair units");
+        }
+        if lr.shape().dims() != [rows, p] || ls.shape().dims() != [p + 1] {
+            bail!("graph block: relative {:?} or score {:?} do not fit", lr.dims(), ls.dims());
+        }
+        if let GraphNoise::Keyed(keys) = &self.noise
+            && keys.len() != rows / n
+        {
+            bail!("graph block: {} noise keys for {} joint states", keys.len(), rows / n);
+        }
+        let y = self.forward(slice(features, lf)?, slice(relative, lr)?, slice(score, ls)?);
+        Ok((CpuStorage::F32(y), Shape::from((rows, self.block.width))))
+    }
+
+    fn bwd(
+        &self,
+        features: &Tensor,
+        relative: &Tensor,
+        score: &Tensor,
+        y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let dy = dy.contiguous()?;
+        let (relative_numbers, score_numbers) = (numbers(relative)?, numbers(score)?);
+        let gradients = with_numbers(features, |f| {
+            with_numbers(y, |y| with_numbers(&dy, |dy| self.backward(f, &relative_numbers, &score_numbers, y, dy)))
+        })???;
+        let device = features.device();
+        Ok((
+            Some(Tensor::from_vec(gradients.features, features.shape(), device)?),
+            Some(Tensor::from_vec(gradients.relative, relative.shape(), device)?),
+            Some(Tensor::from_vec(gradients.score, score.shape(), device)?),
+        ))
+    }
+}

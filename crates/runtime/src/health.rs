@@ -1,0 +1,30 @@
+//! Health that tells the truth: not serving until the service says so, and not serving while it drains.
+
+use tonic::server::NamedService;
+use tonic_health::ServingStatus;
+use tonic_health::pb::health_server::{Health as HealthApi, HealthServer};
+use tonic_health::server::{HealthReporter, health_reporter};
+
+/// Sets the health of one service and of the whole process (the empty service name) together.
+#[derive(Debug, Clone)]
+pub struct Health {
+    reporter: HealthReporter,
+    name: &'static str,
+}
+
+impl Health {
+    /// Starts not serving. The second value is the gRPC service to add to a router.
+    pub async fn new<S: NamedService>() -> (Self, HealthServer<impl HealthApi>) {
+        let (reporter, server) = health_reporter();
+        let health = Self { reporter, name: S::NAME };
+        health.set(false).await;
+        (health, server)
+    }
+
+    /// Ready for requests, or not.
+    pub async fn set(&self, serving: bool) {
+        let status = if serving { ServingStatus::Serving } else { ServingStatus::NotServing };
+        self.reporter.set_service_status("", status).await;
+        self.reporter.set_service_status(self.name, status).await;
+    }
+}

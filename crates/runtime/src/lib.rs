@@ -1,0 +1,11 @@
+//! What every service needs and no domain type: logs, shutdown, sockets, servers, clients, health, retries.
+
+pub mod backoff;
+pub mod client;
+pub mod exit;
+pub mod health;
+pub mod process;
+pub mod server;
+pub mod shutdown;
+pub mod status;
+pub mod telemetry;

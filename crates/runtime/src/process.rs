@@ -1,0 +1,63 @@
+//! The process itself: its environment and its one line of standard output.
+
+use std::io::Write as _;
+use std::net::SocketAddr;
+use std::process::Command;
+
+/// The tensor library must not start threads of its own: it reads these before anything else runs.
+const SINGLE_THREADED: [(&str, &str); 2] = [("RAYON_NUM_THREADS", "1"), ("CANDLE_NUM_THREADS", "1")];
+
+/// The command that runs this process again with single-threaded tensor kernels, or `None` when it already has them.
+/// `main` replaces itself with it (`CommandExt::exec`) before starting any thread.
+pub fn single_threaded_math() -> std::io::Result<Option<Command>> {
+    if SINGLE_THREADED.iter().all(|(name, _)| std::env::var_os(name).is_some()) {
+        return Ok(None);
+    }
+    let mut command = Command::new(std::env::current_exe()?);
+    command.args(std::env::args_os().skip(1));
+    for (name, value) in SINGLE_THREADED {
+        if std::env::var_os(name).is_none() {
+            command.env(name, value);
+        }
+    }
+    Ok(Some(command))
+}
+
+/// Replaces this process with one whose tensor kernels are single-threaded, unless it is such a process already.
+pub fn ensure_single_threaded_math() -> std::io::Result<()> {
+    use std::os::unix::process::CommandExt as _;
+    match single_threaded_math()? {
+        Some(mut command) => Err(command.exec()),
+        None => Ok(()),
+    }
+}
+
+/// The line that tells a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`.
+pub fn ready_line(service: &str, address: Option<SocketAddr>) -> String {
+    let address = address.map(|address| address.to_string());
+    // Written out so that the order of the keys is the documented one.
+    format!(
+        "{{\"ready\":true,\"service\":{},\"address\":{}}}",
+        serde_json::Value::from(service),
+        serde_json::Value::from(address)
+    )
+}
+
+/// Prints [`ready_line`] to standard output: the only thing a service ever writes there.
+pub fn announce_ready(service: &str, address: Option<SocketAddr>) {
+    let mut stdout = std::io::stdout().lock();
+    // A supervisor that closed the pipe does not want to know.
+    let _ = writeln!(stdout, "{}", ready_line(service, address)).and_then(|()| stdout.flush());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ready_line_is_json() {
+        let line = ready_line("learner", Some(([127, 0, 0, 1], 12345).into()));
+        assert_eq!(line, r#"{"ready":true,"service":"learner","address":"127.0.0.1:12345"}"#);
+        assert_eq!(ready_line("actor", None), r#"{"ready":true,"service":"actor","address":null}"#);
+    }
+}

@@ -1,0 +1,56 @@
+//! The error vocabulary of the services.
+
+use std::time::Duration;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt as _};
+
+/// INVALID_ARGUMENT with the field named, also as a machine-readable detail.
+pub fn invalid_argument(field: impl Into<String>, problem: impl Into<String>) -> Status {
+    let (field, problem) = (field.into(), problem.into());
+    let message = format!("{field}: {problem}");
+    Status::with_error_details(Code::InvalidArgument, message, ErrorDetails::with_bad_request_violation(field, problem))
+}
+
+/// FAILED_PRECONDITION: repeating the call does not help until one of the sides is changed.
+pub fn failed_precondition(message: impl Into<String>) -> Status {
+    Status::failed_precondition(message)
+}
+
+/// RESOURCE_EXHAUSTED with a hint when to try again.
+pub fn resource_exhausted(message: impl Into<String>, retry: Duration) -> Status {
+    Status::with_error_details(Code::ResourceExhausted, message, ErrorDetails::with_retry_info(Some(retry)))
+}
+
+/// UNAVAILABLE with a hint when to try again.
+pub fn unavailable(message: impl Into<String>, retry: Duration) -> Status {
+    Status::with_error_details(Code::Unavailable, message, ErrorDetails::with_retry_info(Some(retry)))
+}
+
+/// When the other side suggests to try again.
+pub fn retry_delay(status: &Status) -> Option<Duration> {
+    status.get_details_retry_info().and_then(|info| info.retry_delay)
+}
+
+/// A later attempt of the same call may succeed. What tonic makes of a broken connection (UNKNOWN, CANCELLED) counts.
+pub fn is_transient(status: &Status) -> bool {
+    matches!(
+        status.code(),
+        Code::Unavailable | Code::DeadlineExceeded | Code::Cancelled | Code::Unknown | Code::ResourceExhausted | Code::Aborted
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn details_travel_with_the_status() {
+        let status = invalid_argument("agents.array", "missing");
+        assert_eq!(status.message(), "agents.array: missing");
+        let details = status.get_details_bad_request().unwrap();
+        assert_eq!(details.field_violations[0].field, "agents.array");
+        let status = unavailable("no weights yet", Duration::from_millis(500));
+        assert_eq!(retry_delay(&status), Some(Duration::from_millis(500)));
+        assert!(is_transient(&status) && !is_transient(&invalid_argument("x", "y")));
+    }
+}

@@ -1,0 +1,115 @@
+//! An iteration's trajectories as the update wants them: episode by episode, features computed once.
+
+use magex_core::keys::episode_keys;
+use magex_core::rng::sequence;
+use magex_core::trajectory::{Shape, Trajectory};
+use magex_nets::features::{FeatureSpec, Features, JointStates};
+use rayon::prelude::*;
+
+/// E episodes of T steps of N agents. Rows of `features` are ordered [E, T+1, N], everything else [E, T, N].
+#[derive(Debug)]
+pub struct Batch {
+    /// Sizes; `episodes` is E.
+    pub shape: Shape,
+    /// Features of every state, one block of (T+1)·N rows per episode.
+    pub features: Vec<Features>,
+    /// [E, T, N, H]
+    pub actions: Vec<u8>,
+    /// [E, T, N]
+    pub log_probs: Vec<f32>,
+    /// [E, T, N]
+    pub rewards: Vec<f32>,
+    /// [E] bases of the keys of the graph's noise; step t of episode e uses `sequence(base, t)`.
+    pub noise: Vec<u64>,
+}
+
+impl Batch {
+    /// From trajectories sorted by shard index. All have the same shape but for the number of episodes.
+    pub fn new(seed: u64, spec: &FeatureSpec, trajectories: &[Trajectory]) -> Self {
+        let episodes: Vec<(&Trajectory, usize)> =
+            trajectories.iter().flat_map(|t| (0..t.shape.episodes).map(move |b| (t, b))).collect();
+        let mut shape = trajectories.first().map_or(
+            Shape { steps: 0, episodes: 0, agents: 0, bodies: 0, landmarks: 0, dims: 0, targets: 0, heads: 0 },
+            |t| t.shape,
+        );
+        shape.episodes = episodes.len();
+        let features = episodes.par_iter().map(|(t, b)| episode_features(spec, t, *b)).collect();
+        let rows = episodes.len() * shape.steps * shape.agents;
+        let mut batch = Self {
+            shape,
+            features,
+            actions: Vec::with_capacity(rows * shape.heads),
+            log_probs: Vec::with_capacity(rows),
+            rewards: Vec::with_capacity(rows),
+            noise: Vec::with_capacity(episodes.len()),
+        };
+        for (t, b) in &episodes {
+            for step in 0..shape.steps {
+                let at = (step * t.shape.episodes + b) * shape.agents;
+                batch.actions.extend_from_slice(&t.actions[at * shape.heads..(at + shape.agents) * shape.heads]);
+                batch.log_probs.extend_from_slice(&t.log_probs[at..at + shape.agents]);
+                batch.rewards.extend_from_slice(&t.rewards[at..at + shape.agents]);
+            }
+            batch.noise.push(episode_keys(seed, &t.shard, *b as u32).graph.stream().bits64());
+        }
+        batch
+    }
+
+    /// Features of `steps` steps from `start` of several episodes, ordered [L, C, N].
+    pub fn gather(&self, units: &[(usize, usize)], steps: usize) -> Features {
+        let (n, rows) = (self.shape.agents, (self.shape.steps + 1) * self.shape.agents);
+        let mut out = Features::default();
+        for l in 0..steps {
+            for &(episode, start) in units {
+                out.append(&self.features[episode], (start + l) * n, n, rows);
+            }
+        }
+        out
+    }
+
+    /// Noise keys of the same states, ordered [L, C].
+    pub fn noise_keys(&self, units: &[(usize, usize)], steps: usize) -> Vec<u64> {
+        (0..steps)
+            .flat_map(|l| units.iter().map(move |&(episode, start)| sequence(self.noise[episode], (start + l) as u32)))
+            .collect()
+    }
+
+    /// Rows of a [E, T, N, width] array for the same states, ordered [L, C, N, width].
+    pub fn rows<T: Copy>(&self, data: &[T], width: usize, units: &[(usize, usize)], steps: usize) -> Vec<T> {
+        let block = self.shape.agents * width;
+        let mut out = Vec::with_capacity(units.len() * steps * block);
+        for l in 0..steps {
+            for &(episode, start) in units {
+                let at = (episode * self.shape.steps + start + l) * block;
+                out.extend_from_slice(&data[at..at + block]);
+            }
+        }
+        out
+    }
+}
+
+/// Features of all T+1 states of one episode of a trajectory.
+fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
+    let s = &t.shape;
+    let (n, d, k) = (s.agents, s.dims, s.targets);
+    let states = s.steps + 1;
+    let mut positions = Vec::with_capacity(states * n * d);
+    let mut velocities = Vec::with_capacity(states * n * d);
+    for step in 0..states {
+        let at = (step * s.episodes + b) * s.bodies * d;
+        positions.extend_from_slice(&t.positions[at..at + n * d]);
+        velocities.extend_from_slice(&t.velocities[at..at + n * d]);
+    }
+    let landmarks = &t.landmarks[b * s.landmarks * d..(b + 1) * s.landmarks * d];
+    let goals = &t.goals[b * n * k..(b + 1) * n * k];
+    let once: Vec<f32> = goals.iter().flat_map(|&g| &landmarks[g as usize * d..(g as usize + 1) * d]).copied().collect();
+    let targets = once.repeat(states);
+    spec.compute(&JointStates {
+        agents: n,
+        dims: d,
+        targets_per_agent: k,
+        positions: &positions,
+        velocities: &velocities,
+        targets: &targets,
+    })
+}

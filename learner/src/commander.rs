@@ -1,0 +1,217 @@
+//! PPO for the goal commander: one decision per episode, reward R_c = 1 − C_c / C_h (paper, eq. 4), known as soon as
+//! the decision is made.
+//!
+//! The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic is needed. The
+//! surrogate is clipped pick by pick: the ratio of a whole 50-agent decision would leave the clip range at once.
+
+use crate::adam::Adam;
+use candle_core::{DType, Device, Tensor, Var};
+use magex_core::config::CommanderConfig;
+use magex_core::rng::{Key, Purpose};
+use magex_core::trajectory::Trajectory;
+use magex_nets::commander::{Commander, CommanderError, Instance, Team};
+use magex_nets::ops::Pick;
+use magex_nets::params::Params;
+
+/// Everything that learning changes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommanderState {
+    /// Scheduler network; empty if the scheduler is not learned.
+    pub params: Params,
+    /// Moments of its gradient.
+    pub adam: Adam,
+}
+
+/// One team and what was decided for it.
+#[derive(Debug, Clone)]
+pub struct Sample {
+    /// What the network saw.
+    pub instance: Instance,
+    /// What was decided, in the order of the picks.
+    pub picks: Vec<Pick>,
+    /// R_c of the decision minus R_c of the greedy decision.
+    pub advantage: f32,
+}
+
+/// What an update did.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct CommanderStats {
+    /// Clipped surrogate loss.
+    pub loss: f64,
+    /// Mean entropy of a pick, in nats.
+    pub entropy: f64,
+    /// C_c / C_h of the greedy decision on the iteration's teams.
+    pub greedy_cost_ratio: f64,
+    /// max over episodes of |Δ log-probability of the whole decision| / picks between commander and learner.
+    pub first_ratio_error: f64,
+}
+
+/// The algorithm with its settings.
+#[derive(Debug, Clone)]
+pub struct CommanderPpo {
+    config: CommanderConfig,
+    agents: usize,
+    dims: usize,
+    seed: u64,
+}
+
+impl CommanderPpo {
+    /// For teams of `agents` agents.
+    pub fn new(config: &CommanderConfig, agents: usize, dims: usize, seed: u64) -> Self {
+        Self { config: config.clone(), agents, dims, seed }
+    }
+
+    /// Fresh network and optimiser.
+    pub fn start(&self) -> Result<CommanderState, CommanderError> {
+        let params = Commander::start(&self.config, self.agents, self.dims, self.seed)?;
+        Ok(CommanderState { adam: Adam::new(params.numbers.len()), params })
+    }
+
+    /// One update on the decisions of an iteration's episodes. Does nothing if the scheduler is not learned.
+    pub fn update(
+        &self,
+        state: &mut CommanderState,
+        trajectories: &[Trajectory],
+        iteration: u32,
+        progress_rate: f64,
+    ) -> Result<CommanderStats, CommanderError> {
+        if !self.config.kind.learned() {
+            return Ok(CommanderStats::default());
+        }
+        let commander =
+            Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(state.params.plain()?))?;
+        let mut samples = Vec::new();
+        let (mut ratio_sum, mut error) = (0.0, 0.0f64);
+        for t in trajectories {
+            let (n, d, g) = (t.shape.agents, t.shape.dims, t.shape.landmarks);
+            for b in 0..t.shape.episodes {
+                let team = Team {
+                    agents: &t.positions[b * t.shape.bodies * d..][..n * d],
+                    goals: &t.landmarks[b * g * d..(b + 1) * g * d],
+                    dims: d,
+                };
+                let instance = commander.instance(&team)?;
+                let goals = &t.goals[b * n..(b + 1) * n];
+                let picks = instance
+                    .picks_of(goals)
+                    .ok_or_else(|| CommanderError::Instance(format!("the goals of episode {b} are not one-to-one")))?;
+                let greedy = greedy_cost(&commander, &instance, &team)?;
+                let exact = f64::from(t.exact_costs[b]).max(1e-9);
+                let advantage = (greedy - f64::from(t.costs[b])) / exact;
+                ratio_sum += greedy / exact;
+                let log_probs = commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
+                let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
+                error = error.max(f64::from((total - t.goal_log_probs[b]).abs()) / picks.len().max(1) as f64);
+                samples.push(Sample { instance, picks, advantage: advantage as f32 });
+            }
+        }
+        let mut stats = self.improve(state, &samples, iteration, progress_rate)?;
+        stats.greedy_cost_ratio = ratio_sum / samples.len().max(1) as f64;
+        stats.first_ratio_error = error;
+        Ok(stats)
+    }
+
+    /// PPO epochs over given samples.
+    pub fn improve(
+        &self,
+        state: &mut CommanderState,
+        samples: &[Sample],
+        iteration: u32,
+        progress_rate: f64,
+    ) -> Result<CommanderStats, CommanderError> {
+        let c = &self.config;
+        // Scaled, not centred: the self-critical baseline already is the centre.
+        let square = samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>() / samples.len().max(1) as f64;
+        let scale = (1.0 / (square.sqrt() + 1e-6)) as f32;
+        let old = self.log_probs_of(state, samples)?;
+        let mut stats = CommanderStats::default();
+        let mut count = 0.0;
+        for epoch in 0..c.epochs {
+            let mut order: Vec<usize> = (0..samples.len()).collect();
+            Key::new(self.seed, Purpose::Shuffle, &[iteration, epoch as u32, 1]).stream().shuffle(&mut order);
+            for minibatch in order.chunks(c.minibatch) {
+                let variables = state.params.variables()?;
+                let tensors = variables.iter().map(|v: &Var| v.as_tensor().clone()).collect();
+                let commander =
+                    Commander::build(c, self.agents, self.dims, &mut state.params.source(tensors))?;
+                let instances: Vec<Instance> = minibatch.iter().map(|&i| samples[i].instance.clone()).collect();
+                let picks: Vec<Vec<Pick>> = minibatch.iter().map(|&i| samples[i].picks.clone()).collect();
+                let now = commander.pick_log_probs(&instances, &picks)?;
+                let rows = now.dim(1)?;
+                let old: Vec<f32> = minibatch.iter().flat_map(|&i| old[i].iter().copied()).collect();
+                let advantage: Vec<f32> = minibatch
+                    .iter()
+                    .flat_map(|&i| std::iter::repeat_n(samples[i].advantage * scale, samples[i].picks.len()))
+                    .collect();
+                let (old, advantage) =
+                    (Tensor::from_vec(old, rows, &Device::Cpu)?, Tensor::from_vec(advantage, rows, &Device::Cpu)?);
+                let ratio = (now.get(0)? - old)?.exp()?;
+                let (low, high) = (f64::from(1.0 - c.clip), f64::from(1.0 + c.clip));
+                let surrogate = (&ratio * &advantage)?.minimum(&(ratio.clamp(low, high)? * &advantage)?)?;
+                let mean = |x: Tensor| -> candle_core::Result<Tensor> { x.sum_all()?.affine(1.0 / rows as f64, 0.0) };
+                let (surrogate, entropy) = (mean(surrogate)?, mean(now.get(1)?)?);
+                let loss = (surrogate.neg()? - (&entropy * f64::from(c.entropy))?)?;
+                let gradients = loss.backward()?;
+                let mut flat = Vec::with_capacity(state.params.numbers.len());
+                for variable in &variables {
+                    let gradient = match gradients.get(variable) {
+                        Some(gradient) => gradient.clone(),
+                        None => Tensor::zeros(variable.shape(), DType::F32, &Device::Cpu)?,
+                    };
+                    flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
+                }
+                stats.loss -= f64::from(surrogate.to_scalar::<f32>()?);
+                stats.entropy += f64::from(entropy.to_scalar::<f32>()?);
+                count += 1.0;
+                state.adam.step(
+                    &mut state.params.numbers,
+                    &flat,
+                    c.learning_rate * progress_rate,
+                    1e-5,
+                    c.max_grad_norm.into(),
+                );
+            }
+        }
+        stats.loss /= f64::max(count, 1.0);
+        stats.entropy /= f64::max(count, 1.0);
+        Ok(stats)
+    }
+
+    /// Log-probabilities of every pick under the present weights.
+    fn log_probs_of(&self, state: &CommanderState, samples: &[Sample]) -> Result<Vec<Vec<f32>>, CommanderError> {
+        let commander =
+            Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(state.params.plain()?))?;
+        samples
+            .iter()
+            .map(|s| {
+                let both =
+                    commander.pick_log_probs(std::slice::from_ref(&s.instance), std::slice::from_ref(&s.picks))?;
+                Ok(both.get(0)?.to_vec1::<f32>()?)
+            })
+            .collect()
+    }
+}
+
+/// C of the most likely decision.
+pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) -> Result<f64, CommanderError> {
+    let scores = commander.scores(std::slice::from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
+    Ok(cost(team, &instance.decide(&scores, None).0.goals))
+}
+
+/// C: summed distance of an assignment, in double precision.
+pub fn cost(team: &Team<'_>, goals: &[u32]) -> f64 {
+    let d = team.dims;
+    goals
+        .iter()
+        .enumerate()
+        .map(|(agent, &goal)| {
+            let square: f64 = (0..d)
+                .map(|k| {
+                    let gap = f64::from(team.agents[agent * d + k]) - f64::from(team.goals[goal as usize * d + k]);
+                    gap * gap
+                })
+                .sum();
+            square.sqrt()
+        })
+        .sum()
+}

@@ -1,0 +1,73 @@
+//! Synthetic shards and results for tests.
+
+use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+use magex_core::task::{Spawn, TaskConfig};
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, Trajectory};
+
+pub(crate) fn task() -> TaskConfig {
+    TaskConfig { horizon: 3, ..TaskConfig::simple_spread(5, Spawn::Uniform) }
+}
+
+pub(crate) fn train_shard(iteration: u32, index: u32, episodes: u32) -> Shard {
+    Shard {
+        kind: ShardKind::Train,
+        iteration: Iteration(iteration),
+        index,
+        episodes,
+        first_episode: index * episodes,
+        version: WeightsVersion(iteration),
+        mode: Mode::Sampled,
+        eval_set: 0,
+        record: false,
+    }
+}
+
+fn shape(task: &TaskConfig, episodes: usize) -> Shape {
+    let (n, steps) = (task.agents, task.horizon as usize);
+    Shape { steps, episodes, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 }
+}
+
+fn metrics(episodes: usize) -> Vec<EpisodeMetrics> {
+    let one = EpisodeMetrics {
+        success: 0.5,
+        matched_success: 0.5,
+        arrival_step: 2,
+        collisions_per_agent_step: 0.1,
+        reward: -0.2,
+        cost_ratio: 1.1,
+    };
+    vec![one; episodes]
+}
+
+pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
+    let shape = shape(task, shard.episodes as usize);
+    let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
+    Trajectory {
+        shard,
+        shape,
+        positions: vec![0.5; (t + 1) * b * n * 2],
+        velocities: vec![0.1; (t + 1) * b * n * 2],
+        landmarks: vec![0.2; b * n * 2],
+        goals: (0..b * n).map(|i| (i % n) as u32).collect(),
+        actions: vec![1; t * b * n],
+        log_probs: vec![-1.0; t * b * n],
+        rewards: vec![0.3; t * b * n],
+        goal_log_probs: vec![-2.0; b],
+        costs: vec![2.0; b],
+        exact_costs: vec![1.5; b],
+        metrics: metrics(b),
+    }
+}
+
+pub(crate) fn eval_outcome(task: &TaskConfig, mut shard: Shard, record: bool) -> EvalOutcome {
+    (shard.kind, shard.record) = (ShardKind::Eval, record);
+    let shape = shape(task, 1);
+    let n = shape.agents;
+    let recording = record.then(|| Recording {
+        shape,
+        positions: vec![0.5; (shape.steps + 1) * n * 2],
+        landmarks: vec![0.2; n * 2],
+        goals: (0..n as u32).collect(),
+    });
+    EvalOutcome { shard, metrics: metrics(shard.episodes as usize), recording }
+}

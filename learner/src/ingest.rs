@@ -1,0 +1,205 @@
+//! The door: what a result must be like before the learner trains on it.
+
+use bytes::Bytes;
+use magex_core::ids::{RunId, Shard};
+use magex_core::task::{TaskConfig, TaskName};
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
+use magex_proto::convert::{ConvertError, Delivery, decode_result};
+
+/// What results of a run look like, and how much of everything the learner takes on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Limits {
+    /// Sizes of a result's arrays; `episodes` is the most that a shard may have.
+    pub shape: Shape,
+    /// Choices of each action component.
+    pub action_heads: Vec<usize>,
+    /// Actors connected at the same time.
+    pub max_actors: usize,
+}
+
+impl Limits {
+    /// The limits of a task whose shards have at most `max_episodes` episodes.
+    pub fn for_task(task: &TaskConfig, max_episodes: usize) -> Self {
+        let action_heads = task.action_heads();
+        let shape = match task.name {
+            TaskName::SimpleSpread => Shape {
+                steps: task.horizon as usize,
+                episodes: max_episodes,
+                agents: task.agents,
+                bodies: task.agents,
+                landmarks: task.agents,
+                dims: task.dims(),
+                targets: 1,
+                heads: action_heads.len(),
+            },
+        };
+        Self { shape, action_heads, max_actors: 256 }
+    }
+
+    /// Longest encoded result, bytes: its arrays, and a generous envelope.
+    pub fn max_result_bytes(&self) -> usize {
+        let s = &self.shape;
+        let (t, b, n) = (s.steps, s.episodes, s.agents);
+        let state = (t + 1) * b * s.bodies * s.dims;
+        let floats = 2 * state + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b;
+        let goals = b * n * s.targets;
+        4 * (floats + goals) + t * b * n * s.heads + 64 * b + 64 * 1024
+    }
+}
+
+/// Decodes a result and checks everything that can be checked without knowing the plan: identity of the run, shapes, ranges,
+/// and that every number is one.
+///
+/// # Errors
+/// Names the field, and the place within it.
+pub fn admit(limits: &Limits, run_id: &RunId, bytes: Bytes) -> Result<Delivery, ConvertError> {
+    let delivery = decode_result(bytes)?;
+    if delivery.run_id != *run_id {
+        let problem = format!("'{}' where '{run_id}' is expected", delivery.run_id);
+        return Err(ConvertError::new("run_id", problem));
+    }
+    let shard = delivery.result.shard();
+    if shard.episodes == 0 || shard.episodes as usize > limits.shape.episodes {
+        let problem = format!("{} is outside 1..={}", shard.episodes, limits.shape.episodes);
+        return Err(ConvertError::new("shard.episodes", problem));
+    }
+    match &delivery.result {
+        ShardResult::Train(trajectory) => check_trajectory(limits, trajectory)?,
+        ShardResult::Eval(outcome) => check_eval(limits, outcome)?,
+    }
+    Ok(delivery)
+}
+
+fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), ConvertError> {
+    check_shape("trajectory.shape", &trajectory.shape, limits, trajectory.shard.episodes as usize)?;
+    trajectory.validate().map_err(|problem| match problem.split_once(": ") {
+        Some((field, problem)) => ConvertError::new(field, problem),
+        None => ConvertError::new("trajectory", problem),
+    })?;
+    let heads = limits.action_heads.len().max(1);
+    for (place, action) in trajectory.actions.iter().enumerate() {
+        let choices = limits.action_heads.get(place % heads).copied().unwrap_or(0);
+        if usize::from(*action) >= choices {
+            let problem = format!("{action} is not below {choices}");
+            return Err(ConvertError::new(format!("trajectory.actions[{place}]"), problem));
+        }
+    }
+    check_metrics("trajectory.metrics", &trajectory.metrics)
+}
+
+fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError> {
+    let (found, expected) = (outcome.metrics.len(), outcome.shard.episodes as usize);
+    if found != expected {
+        return Err(ConvertError::new("eval.metrics", format!("{found} episodes where {expected} are expected")));
+    }
+    check_metrics("eval.metrics", &outcome.metrics)?;
+    match (&outcome.recording, outcome.shard.record) {
+        (Some(recording), true) => check_recording(limits, recording),
+        (None, false) => Ok(()),
+        (Some(_), false) => Err(ConvertError::new("eval.recording", "not asked for")),
+        (None, true) => Err(ConvertError::missing("eval.recording")),
+    }
+}
+
+fn check_recording(limits: &Limits, recording: &Recording) -> Result<(), ConvertError> {
+    check_shape("eval.recording.shape", &recording.shape, limits, 1)?;
+    for (name, values) in [("positions", &recording.positions), ("landmarks", &recording.landmarks)] {
+        if let Some(place) = values.iter().position(|value| !value.is_finite()) {
+            let problem = format!("{} is not finite", values[place]);
+            return Err(ConvertError::new(format!("eval.recording.{name}[{place}]"), problem));
+        }
+    }
+    let bound = limits.shape.landmarks.max(limits.shape.bodies);
+    match recording.goals.iter().position(|&goal| goal as usize >= bound) {
+        Some(place) => Err(ConvertError::new(
+            format!("eval.recording.goals[{place}]"),
+            format!("{} is not below {bound}", recording.goals[place]),
+        )),
+        None => Ok(()),
+    }
+}
+
+fn check_shape(field: &str, shape: &Shape, limits: &Limits, episodes: usize) -> Result<(), ConvertError> {
+    let expected = Shape { episodes, ..limits.shape };
+    if *shape == expected {
+        return Ok(());
+    }
+    Err(ConvertError::new(field, format!("{shape:?} where the task has {expected:?}")))
+}
+
+fn check_metrics(field: &str, metrics: &[EpisodeMetrics]) -> Result<(), ConvertError> {
+    for (place, m) in metrics.iter().enumerate() {
+        let named = [
+            ("success", m.success),
+            ("matched_success", m.matched_success),
+            ("collisions_per_agent_step", m.collisions_per_agent_step),
+            ("reward", m.reward),
+            ("cost_ratio", m.cost_ratio),
+        ];
+        if let Some((name, value)) = named.into_iter().find(|(_, value)| !value.is_finite()) {
+            return Err(ConvertError::new(format!("{field}[{place}].{name}"), format!("{value} is not finite")));
+        }
+    }
+    Ok(())
+}
+
+/// What identifies a shard to a person.
+pub(crate) fn describe(shard: &Shard) -> String {
+    format!("{:?} shard {} of iteration {}", shard.kind, shard.index, shard.iteration).to_lowercase()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixtures::{eval_outcome, task, train_shard, trajectory};
+    use magex_proto::convert::encode_result;
+
+    fn limits() -> Limits {
+        Limits::for_task(&task(), 4)
+    }
+
+    fn verdict(result: ShardResult) -> Result<Delivery, String> {
+        let run = RunId("r".into());
+        admit(&limits(), &run, encode_result(&run, "sha", &result)).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn what_the_task_makes_is_admitted_and_fits_the_byte_limit() {
+        let result = ShardResult::Train(trajectory(&task(), train_shard(0, 0, 4)));
+        let run = RunId("r".into());
+        assert!(encode_result(&run, "sha", &result).len() <= limits().max_result_bytes());
+        assert_eq!(verdict(result.clone()).unwrap().result, result);
+        let result = ShardResult::Eval(eval_outcome(&task(), train_shard(0, 0, 2), true));
+        assert!(verdict(result).is_ok());
+    }
+
+    #[test]
+    fn garbage_is_named_and_refused() {
+        let check = |damage: fn(&mut Trajectory), words: &str| {
+            let mut bad = trajectory(&task(), train_shard(0, 0, 2));
+            damage(&mut bad);
+            let error = verdict(ShardResult::Train(bad)).unwrap_err();
+            assert!(error.starts_with(words), "{error}");
+        };
+        check(|t| t.positions[5] = f32::NAN, "trajectory.positions[5]: NaN is not finite");
+        check(|t| t.rewards[2] = f32::INFINITY, "trajectory.rewards[2]: inf");
+        check(|t| t.log_probs[0] = 0.5, "trajectory.log_probs[0]: 0.5 is above 0");
+        check(|t| t.actions[3] = 5, "trajectory.actions[3]: 5 is not below 5");
+        check(|t| t.goals[0] = 99, "trajectory.goals[0]: 99 is not below");
+        check(|t| t.metrics[1].reward = f32::NAN, "trajectory.metrics[1].reward: NaN");
+        check(|t| t.shard.episodes = 5, "shard.episodes: 5 is outside 1..=4");
+        check(|t| t.shard.episodes = 1, "trajectory.shape: ");
+        let other = encode_result(&RunId("other".into()), "", &ShardResult::Train(trajectory(&task(), train_shard(0, 0, 1))));
+        assert!(admit(&limits(), &RunId("r".into()), other).unwrap_err().to_string().contains("'other' where 'r'"));
+    }
+
+    #[test]
+    fn a_recording_comes_when_and_only_when_asked_for() {
+        let mut shard = train_shard(0, 0, 2);
+        let outcome = eval_outcome(&task(), shard, false);
+        assert!(verdict(ShardResult::Eval(outcome)).is_ok());
+        shard.record = true;
+        let error = verdict(ShardResult::Eval(EvalOutcome { shard, ..eval_outcome(&task(), shard, false) })).unwrap_err();
+        assert_eq!(error, "eval.recording: missing");
+    }
+}

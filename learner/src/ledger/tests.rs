@@ -1,0 +1,187 @@
+use super::*;
+use magex_core::ids::{Iteration, Mode, ShardKind, WeightsVersion};
+use magex_core::trajectory::EvalOutcome;
+use proptest::prelude::*;
+
+const A: SessionId = SessionId(1);
+const B: SessionId = SessionId(2);
+
+fn shard(iteration: u32, index: u32) -> Shard {
+    Shard {
+        kind: ShardKind::Eval,
+        iteration: Iteration(iteration),
+        index,
+        episodes: 1,
+        first_episode: index,
+        version: WeightsVersion(iteration),
+        mode: Mode::Greedy,
+        eval_set: 1,
+        record: false,
+    }
+}
+
+fn plan(iteration: u32, shards: u32) -> Vec<Shard> {
+    (0..shards).map(|index| shard(iteration, index)).collect()
+}
+
+fn result(shard: Shard) -> ShardResult {
+    ShardResult::Eval(EvalOutcome { shard, metrics: Vec::new(), recording: None })
+}
+
+fn opened(shards: u32) -> Ledger {
+    let mut ledger = Ledger::new(100);
+    ledger.open(plan(0, shards)).unwrap();
+    ledger
+}
+
+#[test]
+fn results_come_out_in_the_order_of_the_plan() {
+    let mut ledger = opened(3);
+    let leases: Vec<Lease> = (0..3).map(|_| ledger.lease(A).unwrap()).collect();
+    assert!(ledger.lease(B).is_none());
+    for lease in [leases[2], leases[0], leases[1]] {
+        assert!(ledger.take().is_none());
+        assert_eq!(ledger.complete(A, lease.id, result(lease.shard)), Verdict::Accepted);
+    }
+    let order: Vec<u32> = ledger.take().unwrap().iter().map(|result| result.shard().index).collect();
+    assert_eq!(order, [0, 1, 2]);
+    assert!(ledger.take().is_none() && ledger.progress() == (0, 0));
+}
+
+#[test]
+fn the_leases_of_a_lost_actor_come_next_and_in_order() {
+    let mut ledger = opened(4);
+    ledger.lease(A).unwrap();
+    ledger.lease(A).unwrap();
+    assert_eq!(ledger.drop_actor(A), 2);
+    let order: Vec<u32> = std::iter::from_fn(|| ledger.lease(B)).map(|lease| lease.shard.index).collect();
+    assert_eq!(order, [0, 1, 2, 3]);
+    assert_eq!(ledger.counters(), Counters { leased: 6, expired: 2, outstanding: 4, ..Counters::default() });
+}
+
+#[test]
+fn the_late_result_of_a_lost_lease_counts_once() {
+    let mut ledger = opened(1);
+    let lost = ledger.lease(A).unwrap();
+    ledger.drop_actor(A);
+    let again = ledger.lease(B).unwrap();
+    assert_eq!(ledger.complete(A, lost.id, result(lost.shard)), Verdict::Accepted);
+    assert_eq!(ledger.complete(B, again.id, result(again.shard)), Verdict::Duplicate);
+    let counters = ledger.counters();
+    assert_eq!((counters.leased, counters.trained, counters.duplicate, counters.expired), (3, 1, 1, 1));
+    assert_eq!(counters.residual(), 0);
+}
+
+#[test]
+fn a_result_of_another_shard_than_the_leased_one_is_rejected_and_redone() {
+    let mut ledger = opened(2);
+    let lease = ledger.lease(A).unwrap();
+    assert!(matches!(ledger.complete(A, lease.id, result(shard(0, 1))), Verdict::Rejected(_)));
+    assert_eq!(ledger.lease(A).unwrap().shard, lease.shard);
+    assert_eq!(ledger.counters().residual(), 0);
+}
+
+#[test]
+fn a_shard_that_nobody_can_do_is_given_up_and_one_that_may_succeed_is_not() {
+    let mut ledger = opened(1);
+    for _ in 0..10 {
+        let lease = ledger.lease(A).unwrap();
+        ledger.fail(A, lease.id, "no weights yet", true);
+    }
+    assert_eq!(ledger.given_up(), None);
+    for _ in 0..MAX_FAILURES {
+        let lease = ledger.lease(A).unwrap();
+        ledger.fail(A, lease.id, "no such task", false);
+    }
+    assert_eq!(ledger.given_up().unwrap().reason, "no such task");
+}
+
+#[test]
+fn plans_that_make_no_sense_are_refused() {
+    let mut ledger = Ledger::new(0);
+    assert_eq!(ledger.open(Vec::new()), Err(PlanError::Empty));
+    assert_eq!(ledger.open(vec![shard(1, 2), shard(1, 2)]), Err(PlanError::Repeated(2, 1)));
+    ledger.open(plan(0, 2)).unwrap();
+    assert_eq!(ledger.open(plan(1, 2)), Err(PlanError::Open { done: 0, total: 2 }));
+    ledger.abandon();
+    ledger.open(plan(1, 2)).unwrap();
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    Lease(u64),
+    Complete { actor: u64, lease: usize },
+    Reject { actor: u64, lease: usize },
+    Fail { actor: u64, lease: usize, retryable: bool },
+    Drop(u64),
+    Abandon,
+}
+
+fn steps() -> impl Strategy<Value = Vec<Step>> {
+    let pair = || (0u64..3, 0usize..40);
+    let step = prop_oneof![
+        6 => (0u64..3).prop_map(Step::Lease),
+        6 => pair().prop_map(|(actor, lease)| Step::Complete { actor, lease }),
+        1 => pair().prop_map(|(actor, lease)| Step::Reject { actor, lease }),
+        1 => (pair(), any::<bool>()).prop_map(|((actor, lease), retryable)| Step::Fail { actor, lease, retryable }),
+        1 => (0u64..3).prop_map(Step::Drop),
+        1 => Just(Step::Abandon),
+    ];
+    prop::collection::vec(step, 0..200)
+}
+
+proptest! {
+    /// Whatever happens: no lease is lost or counted twice, no shard is trained twice, and one good actor finishes the plan.
+    #[test]
+    fn every_lease_ends_once_and_every_plan_can_be_finished(steps in steps(), shards in 1u32..6) {
+        let mut ledger = Ledger::new(0);
+        let mut iteration = 0;
+        let mut seen: Vec<Lease> = Vec::new();
+        let mut handed_out = 0;
+        ledger.open(plan(0, shards)).unwrap();
+        for step in steps {
+            let pick = |lease: usize| seen.get(lease % seen.len().max(1)).copied();
+            match step {
+                Step::Lease(actor) => seen.extend(ledger.lease(SessionId(actor))),
+                Step::Complete { actor, lease } => if let Some(lease) = pick(lease) {
+                    ledger.complete(SessionId(actor), lease.id, result(lease.shard));
+                },
+                Step::Reject { actor, lease } => if let Some(lease) = pick(lease) {
+                    ledger.reject(SessionId(actor), lease.id);
+                },
+                Step::Fail { actor, lease, retryable } => if let Some(lease) = pick(lease) {
+                    ledger.fail(SessionId(actor), lease.id, "x", retryable);
+                },
+                Step::Drop(actor) => {
+                    ledger.drop_actor(SessionId(actor));
+                    prop_assert_eq!(ledger.leases_of(SessionId(actor)), 0);
+                }
+                Step::Abandon => {
+                    ledger.abandon();
+                    iteration += 1;
+                    ledger.open(plan(iteration, shards)).unwrap();
+                }
+            }
+            prop_assert_eq!(ledger.counters().residual(), 0);
+            let (done, total) = ledger.progress();
+            prop_assert!(done <= total);
+            if let Some(results) = ledger.take() {
+                handed_out += results.len() as u64;
+                prop_assert!(results.iter().map(|r| *r.shard()).eq(plan(iteration, shards)));
+                iteration += 1;
+                ledger.open(plan(iteration, shards)).unwrap();
+            }
+        }
+        for actor in 0..3 {
+            ledger.drop_actor(SessionId(actor));
+        }
+        while let Some(lease) = ledger.lease(SessionId(9)) {
+            prop_assert_eq!(ledger.complete(SessionId(9), lease.id, result(lease.shard)), Verdict::Accepted);
+        }
+        let results = ledger.take();
+        prop_assert_eq!(results.map(|r| r.len()), Some(shards as usize));
+        prop_assert_eq!(ledger.counters().residual(), 0);
+        prop_assert_eq!(ledger.counters().outstanding, 0);
+        prop_assert!(ledger.counters().trained >= handed_out + u64::from(shards));
+    }
+}

@@ -1,0 +1,274 @@
+//! What a run writes down: one line per iteration in metrics.jsonl, and summary.json at its end. docs/metrics.md lists
+//! every field.
+
+use crate::checkpoint::Progress;
+use crate::commander::CommanderStats;
+use crate::mappo::UpdateStats;
+use crate::trainer::TrainError;
+use magex_core::config::RunConfig;
+use magex_core::trajectory::EpisodeMetrics;
+use serde::Serialize;
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// Means over the episodes of an evaluation, or of an iteration's training episodes.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EvalSummary {
+    /// Episodes.
+    pub episodes: usize,
+    /// Share of landmarks covered at the last step.
+    pub success_rate: f64,
+    /// Share of landmarks that can be matched one-to-one to agents at the last step.
+    pub matched_success_rate: f64,
+    /// Share of episodes with every landmark covered at the last step.
+    pub all_covered_rate: f64,
+    /// Mean first step with at least 99 % covered; episodes without one count with the horizon + 1.
+    pub arrival_step: f64,
+    /// Other agents closer than two radii, per agent and step.
+    pub collisions_per_agent_step: f64,
+    /// Mean reward per agent and step.
+    pub reward: f64,
+    /// Mean C_c / C_h.
+    pub cost_ratio: f64,
+}
+
+/// Means in the order of the episodes; `None` if there are none.
+pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> Option<EvalSummary> {
+    let episodes: Vec<&EpisodeMetrics> = episodes.into_iter().collect();
+    let count = episodes.len();
+    if count == 0 {
+        return None;
+    }
+    let mean = |f: fn(&EpisodeMetrics) -> f64| episodes.iter().map(|e| f(e)).sum::<f64>() / count as f64;
+    Some(EvalSummary {
+        episodes: count,
+        success_rate: mean(|e| e.success.into()),
+        matched_success_rate: mean(|e| e.matched_success.into()),
+        all_covered_rate: mean(|e| if e.success >= 1.0 { 1.0 } else { 0.0 }),
+        arrival_step: mean(|e| e.arrival_step.into()),
+        collisions_per_agent_step: mean(|e| e.collisions_per_agent_step.into()),
+        reward: mean(|e| e.reward.into()),
+        cost_ratio: mean(|e| e.cost_ratio.into()),
+    })
+}
+
+/// Where an iteration's wall time went, in seconds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Timing {
+    /// Waiting for the actors.
+    pub collect_s: f64,
+    /// Updating the executor.
+    pub executor_s: f64,
+    /// Updating the commander.
+    pub commander_s: f64,
+    /// Writing checkpoints.
+    pub checkpoint_s: f64,
+}
+
+/// One line of metrics.jsonl. Fields of an evaluation are null on iterations without one; fields of training are null on
+/// the last line, which only evaluates.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct IterationMetrics {
+    /// Iterations completed; equals the version of the weights that the evaluation measured on the last line.
+    pub iteration: u32,
+    /// Joint environment steps trained on.
+    pub joint_env_steps: u64,
+    /// Agent steps trained on.
+    pub agent_steps: u64,
+    /// Greedy evaluation of the weights that this iteration started with.
+    pub success_rate: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub matched_success_rate: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub all_covered_rate: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub arrival_step: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub collisions_per_agent_step: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub cost_ratio: Option<f64>,
+    /// Training episodes (sampled actions).
+    pub sampled_success_rate: Option<f64>,
+    /// Training episodes.
+    pub sampled_collisions_per_agent_step: Option<f64>,
+    /// Training episodes (sampled goals).
+    pub sampled_cost_ratio: Option<f64>,
+    /// Training episodes: mean reward per agent and step.
+    pub reward: Option<f64>,
+    /// Executor update.
+    pub executor: Option<UpdateStats>,
+    /// Commander update.
+    pub commander: Option<CommanderStats>,
+    /// Where the time went.
+    pub timing: Timing,
+    /// Joint steps trained on per second of this iteration.
+    pub joint_steps_per_s: f64,
+    /// Seconds since the run began, over all its processes.
+    pub wall_s: f64,
+}
+
+impl IterationMetrics {
+    /// Assembles a line.
+    pub fn new(
+        config: &RunConfig,
+        progress: &Progress,
+        training: Option<EvalSummary>,
+        evaluation: Option<EvalSummary>,
+        timing: Timing,
+        updates: Option<(UpdateStats, CommanderStats)>,
+        wall_s: f64,
+    ) -> Self {
+        let seconds = timing.collect_s + timing.executor_s + timing.commander_s + timing.checkpoint_s;
+        let eval = |f: fn(&EvalSummary) -> f64| evaluation.as_ref().map(f);
+        let train = |f: fn(&EvalSummary) -> f64| training.as_ref().map(f);
+        let steps = if training.is_some() { config.steps_per_iteration() as f64 } else { 0.0 };
+        Self {
+            iteration: progress.iteration,
+            joint_env_steps: progress.joint_env_steps,
+            agent_steps: progress.joint_env_steps * config.task.agents as u64,
+            success_rate: eval(|e| e.success_rate),
+            matched_success_rate: eval(|e| e.matched_success_rate),
+            all_covered_rate: eval(|e| e.all_covered_rate),
+            arrival_step: eval(|e| e.arrival_step),
+            collisions_per_agent_step: eval(|e| e.collisions_per_agent_step),
+            cost_ratio: eval(|e| e.cost_ratio),
+            sampled_success_rate: train(|e| e.success_rate),
+            sampled_collisions_per_agent_step: train(|e| e.collisions_per_agent_step),
+            sampled_cost_ratio: train(|e| e.cost_ratio),
+            reward: train(|e| e.reward),
+            executor: updates.map(|u| u.0),
+            commander: updates.map(|u| u.1),
+            timing,
+            joint_steps_per_s: steps / seconds.max(1e-9),
+            wall_s,
+        }
+    }
+}
+
+/// What a finished run achieved: the evaluation that closes it, on spawns never seen before.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Greedy: share of landmarks covered at the last step.
+    pub success_rate: f64,
+    /// Sampled: the same.
+    pub sampled_success_rate: f64,
+    /// Greedy: one-to-one matched.
+    pub matched_success_rate: f64,
+    /// Greedy: share of episodes with every landmark covered.
+    pub all_covered_rate: f64,
+    /// Greedy: mean first step with at least 99 % covered.
+    pub arrival_step: f64,
+    /// Greedy.
+    pub collisions_per_agent_step: f64,
+    /// Greedy: mean C_c / C_h.
+    pub cost_ratio: f64,
+    /// Joint environment steps trained on.
+    pub joint_env_steps: u64,
+    /// Agent steps trained on.
+    pub agent_steps: u64,
+    /// Seconds of the learner from its start to the end of training, the closing evaluation excluded.
+    pub wall_s: f64,
+    /// Iterations completed.
+    pub iterations: u32,
+    /// Episodes of each closing evaluation.
+    pub final_episodes: u32,
+    /// Whether the target was reached before the budget was spent.
+    pub target_reached: bool,
+    /// SHA-256 of weights.safetensors.
+    pub weights_sha256: String,
+    /// Architecture of the executor.
+    pub executor: String,
+    /// Goal scheduler.
+    pub scheduler: String,
+    /// N.
+    pub agents: usize,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+impl Summary {
+    /// Assembles the summary.
+    pub fn new(
+        config: &RunConfig,
+        progress: &Progress,
+        greedy: &EvalSummary,
+        sampled: &EvalSummary,
+        wall_s: f64,
+        weights_sha256: String,
+    ) -> Self {
+        Self {
+            success_rate: greedy.success_rate,
+            sampled_success_rate: sampled.success_rate,
+            matched_success_rate: greedy.matched_success_rate,
+            all_covered_rate: greedy.all_covered_rate,
+            arrival_step: greedy.arrival_step,
+            collisions_per_agent_step: greedy.collisions_per_agent_step,
+            cost_ratio: greedy.cost_ratio,
+            joint_env_steps: progress.joint_env_steps,
+            agent_steps: progress.joint_env_steps * config.task.agents as u64,
+            wall_s,
+            iterations: progress.iteration,
+            final_episodes: config.run.final_episodes,
+            target_reached: progress.on_target >= 2,
+            weights_sha256,
+            executor: config.executor.kind.to_string(),
+            scheduler: config.commander.kind.to_string(),
+            agents: config.task.agents,
+            seed: config.run.seed,
+        }
+    }
+}
+
+/// metrics.jsonl of a run folder.
+#[derive(Debug)]
+pub struct MetricsFile {
+    file: Option<(File, PathBuf)>,
+}
+
+impl MetricsFile {
+    /// Writes nowhere.
+    pub fn none() -> Self {
+        Self { file: None }
+    }
+
+    /// An empty file.
+    pub fn create(folder: &Path) -> Result<Self, TrainError> {
+        let path = folder.join("metrics.jsonl");
+        let file = File::create(&path).map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        Ok(Self { file: Some((file, path)) })
+    }
+
+    /// The file of a resumed run, cut back to the iterations that the checkpoint contains: the others will be done again,
+    /// with the same numbers.
+    pub fn reopen(folder: &Path, iteration: u32) -> Result<Self, TrainError> {
+        let path = folder.join("metrics.jsonl");
+        let io = |error| TrainError::Io { path: path.clone(), error };
+        let text = std::fs::read_to_string(&path).or_else(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => Ok(String::new()),
+            _ => Err(io(e)),
+        })?;
+        let kept: String = text
+            .lines()
+            .filter(|line| {
+                serde_json::from_str::<serde_json::Value>(line)
+                    .is_ok_and(|v| v["iteration"].as_u64().is_some_and(|i| i <= iteration.into()) && !v["executor"].is_null())
+            })
+            .flat_map(|line| [line, "\n"])
+            .collect();
+        let temporary = folder.join(".metrics.jsonl.tmp");
+        std::fs::write(&temporary, kept).and_then(|()| std::fs::rename(&temporary, &path)).map_err(io)?;
+        let file = OpenOptions::new().append(true).open(&path).map_err(io)?;
+        Ok(Self { file: Some((file, path)) })
+    }
+
+    /// Appends a line and returns it.
+    pub fn append(&mut self, metrics: &IterationMetrics) -> Result<String, TrainError> {
+        let line = serde_json::to_string(metrics).map_err(|e| TrainError::Result(e.to_string()))?;
+        if let Some((file, path)) = &mut self.file {
+            file.write_all(format!("{line}\n").as_bytes())
+                .map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        }
+        Ok(line)
+    }
+}

@@ -1,0 +1,118 @@
+//! Arrays on the wire: little-endian bytes with a type and a shape.
+
+use crate::convert::ConvertError;
+use crate::v1::{Array, DataType};
+use bytes::Bytes;
+
+/// An f32 array of the given shape.
+pub fn from_f32(shape: &[usize], values: &[f32]) -> Array {
+    let mut data = vec![0u8; values.len() * 4];
+    for (slot, value) in data.chunks_exact_mut(4).zip(values) {
+        slot.copy_from_slice(&value.to_le_bytes());
+    }
+    array(DataType::F32, shape, data)
+}
+
+/// A u32 array of the given shape.
+pub fn from_u32(shape: &[usize], values: &[u32]) -> Array {
+    let mut data = vec![0u8; values.len() * 4];
+    for (slot, value) in data.chunks_exact_mut(4).zip(values) {
+        slot.copy_from_slice(&value.to_le_bytes());
+    }
+    array(DataType::U32, shape, data)
+}
+
+/// A u8 array of the given shape.
+pub fn from_u8(shape: &[usize], values: &[u8]) -> Array {
+    array(DataType::U8, shape, values.to_vec())
+}
+
+/// The numbers of an f32 array that must have exactly this shape.
+pub fn to_f32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f32>, ConvertError> {
+    let data = checked(field, array, DataType::F32, shape, 4)?;
+    Ok(data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+}
+
+/// The numbers of a u32 array that must have exactly this shape.
+pub fn to_u32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u32>, ConvertError> {
+    let data = checked(field, array, DataType::U32, shape, 4)?;
+    Ok(data.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+}
+
+/// The numbers of a u8 array that must have exactly this shape.
+pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u8>, ConvertError> {
+    checked(field, array, DataType::U8, shape, 1).map(|data| data.to_vec())
+}
+
+/// The shape of an array, which must have so many axes. `None` when the array is missing.
+pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, ConvertError> {
+    let array = array.ok_or_else(|| ConvertError::missing(field))?;
+    if array.shape.len() != axes {
+        return Err(ConvertError::new(field, format!("shape {:?} has {} axes, not {axes}", array.shape, array.shape.len())));
+    }
+    Ok(array.shape.iter().map(|&extent| extent as usize).collect())
+}
+
+fn array(kind: DataType, shape: &[usize], data: Vec<u8>) -> Array {
+    Array { r#type: kind.into(), shape: shape.iter().map(|&extent| extent as u32).collect(), data: data.into() }
+}
+
+/// Type, shape and length agree with what is expected. Nothing is multiplied before it is known to be expected.
+fn checked(
+    field: &str,
+    array: Option<Array>,
+    kind: DataType,
+    shape: &[usize],
+    size: usize,
+) -> Result<Bytes, ConvertError> {
+    let array = array.ok_or_else(|| ConvertError::missing(field))?;
+    if array.r#type() != kind {
+        return Err(ConvertError::new(
+            field,
+            format!("type {} where {} is expected", array.r#type().as_str_name(), kind.as_str_name()),
+        ));
+    }
+    if !array.shape.iter().map(|&extent| extent as usize).eq(shape.iter().copied()) {
+        return Err(ConvertError::new(field, format!("shape {:?} where {shape:?} is expected", array.shape)));
+    }
+    let expected = shape.iter().try_fold(size, |product, &extent| product.checked_mul(extent));
+    if expected != Some(array.data.len()) {
+        return Err(ConvertError::new(field, format!("{} bytes do not fill shape {shape:?}", array.data.len())));
+    }
+    Ok(array.data)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_bit_pattern_survives() {
+        let values = [0.0, -0.0, f32::MIN_POSITIVE / 2.0, f32::NAN, f32::INFINITY, -1.5];
+        let back = to_f32("x", Some(from_f32(&[2, 3], &values)), &[2, 3]).unwrap();
+        assert_eq!(back.map_bits(), values.to_vec().map_bits());
+        let whole = [0, 1, u32::MAX];
+        assert_eq!(to_u32("x", Some(from_u32(&[3], &whole)), &[3]).unwrap(), whole);
+    }
+
+    trait MapBits {
+        fn map_bits(&self) -> Vec<u32>;
+    }
+    impl MapBits for Vec<f32> {
+        fn map_bits(&self) -> Vec<u32> {
+            self.iter().map(|x| x.to_bits()).collect()
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_named() {
+        let check = |array: Option<Array>, words: &str| {
+            let error = to_f32("team.goals", array, &[2, 2]).unwrap_err().to_string();
+            assert!(error.starts_with("team.goals: ") && error.contains(words), "{error}");
+        };
+        check(None, "missing");
+        check(Some(from_u32(&[2, 2], &[0; 4])), "DATA_TYPE_U32");
+        check(Some(from_f32(&[4], &[0.0; 4])), "[4]");
+        check(Some(from_f32(&[2, 2], &[0.0; 3])), "12 bytes");
+    }
+}

@@ -1,0 +1,277 @@
+//! Domain types to messages and back. Going back checks everything and names the field that does not fit.
+
+use crate::{arrays, v1};
+use bytes::Bytes;
+use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
+use prost::Message as _;
+
+/// A message that does not describe what it claims to.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {problem}")]
+pub struct ConvertError {
+    /// Path of the field, from the outermost message.
+    pub field: String,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+impl ConvertError {
+    /// A problem with a field.
+    pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
+        Self { field: field.into(), problem: problem.into() }
+    }
+
+    /// A field that is needed and not there.
+    pub fn missing(field: impl Into<String>) -> Self {
+        Self::new(field, "missing")
+    }
+
+    /// The same problem, seen from the message that encloses the field.
+    #[must_use]
+    pub fn within(self, outer: &str) -> Self {
+        Self { field: format!("{outer}.{}", self.field), problem: self.problem }
+    }
+}
+
+impl From<ShardKind> for v1::ShardKind {
+    fn from(kind: ShardKind) -> Self {
+        match kind {
+            ShardKind::Train => Self::Train,
+            ShardKind::Eval => Self::Eval,
+        }
+    }
+}
+
+impl From<Mode> for v1::Mode {
+    fn from(mode: Mode) -> Self {
+        match mode {
+            Mode::Sampled => Self::Sampled,
+            Mode::Greedy => Self::Greedy,
+        }
+    }
+}
+
+impl From<&Shard> for v1::Shard {
+    fn from(shard: &Shard) -> Self {
+        Self {
+            kind: v1::ShardKind::from(shard.kind).into(),
+            iteration: shard.iteration.0,
+            index: shard.index,
+            episodes: shard.episodes,
+            first_episode: shard.first_episode,
+            version: shard.version.0,
+            mode: v1::Mode::from(shard.mode).into(),
+            eval_set: shard.eval_set,
+            record: shard.record,
+        }
+    }
+}
+
+impl TryFrom<&v1::Shard> for Shard {
+    type Error = ConvertError;
+    fn try_from(shard: &v1::Shard) -> Result<Self, ConvertError> {
+        let kind = match shard.kind() {
+            v1::ShardKind::Train => ShardKind::Train,
+            v1::ShardKind::Eval => ShardKind::Eval,
+            v1::ShardKind::Unspecified => return Err(ConvertError::new("kind", "not set or unknown")),
+        };
+        let mode = match shard.mode() {
+            v1::Mode::Sampled => Mode::Sampled,
+            v1::Mode::Greedy => Mode::Greedy,
+            v1::Mode::Unspecified => return Err(ConvertError::new("mode", "not set or unknown")),
+        };
+        Ok(Self {
+            kind,
+            iteration: Iteration(shard.iteration),
+            index: shard.index,
+            episodes: shard.episodes,
+            first_episode: shard.first_episode,
+            version: WeightsVersion(shard.version),
+            mode,
+            eval_set: shard.eval_set,
+            record: shard.record,
+        })
+    }
+}
+
+/// The shard of a message that must have one.
+pub fn shard(field: &str, message: Option<&v1::Shard>) -> Result<Shard, ConvertError> {
+    Shard::try_from(message.ok_or_else(|| ConvertError::missing(field))?).map_err(|error| error.within(field))
+}
+
+impl From<&Shape> for v1::Shape {
+    fn from(shape: &Shape) -> Self {
+        Self {
+            steps: shape.steps as u32,
+            episodes: shape.episodes as u32,
+            agents: shape.agents as u32,
+            bodies: shape.bodies as u32,
+            landmarks: shape.landmarks as u32,
+            dims: shape.dims as u32,
+            targets: shape.targets as u32,
+            heads: shape.heads as u32,
+        }
+    }
+}
+
+impl From<&v1::Shape> for Shape {
+    fn from(shape: &v1::Shape) -> Self {
+        Self {
+            steps: shape.steps as usize,
+            episodes: shape.episodes as usize,
+            agents: shape.agents as usize,
+            bodies: shape.bodies as usize,
+            landmarks: shape.landmarks as usize,
+            dims: shape.dims as usize,
+            targets: shape.targets as usize,
+            heads: shape.heads as usize,
+        }
+    }
+}
+
+impl From<&EpisodeMetrics> for v1::EpisodeMetrics {
+    fn from(metrics: &EpisodeMetrics) -> Self {
+        Self {
+            success: metrics.success,
+            matched_success: metrics.matched_success,
+            arrival_step: metrics.arrival_step,
+            collisions_per_agent_step: metrics.collisions_per_agent_step,
+            reward: metrics.reward,
+            cost_ratio: metrics.cost_ratio,
+        }
+    }
+}
+
+impl From<&v1::EpisodeMetrics> for EpisodeMetrics {
+    fn from(metrics: &v1::EpisodeMetrics) -> Self {
+        Self {
+            success: metrics.success,
+            matched_success: metrics.matched_success,
+            arrival_step: metrics.arrival_step,
+            collisions_per_agent_step: metrics.collisions_per_agent_step,
+            reward: metrics.reward,
+            cost_ratio: metrics.cost_ratio,
+        }
+    }
+}
+
+impl From<&Trajectory> for v1::Trajectory {
+    fn from(trajectory: &Trajectory) -> Self {
+        let s = &trajectory.shape;
+        let (t, b, n) = (s.steps, s.episodes, s.agents);
+        let state = [t + 1, b, s.bodies, s.dims];
+        Self {
+            shape: Some(s.into()),
+            positions: Some(arrays::from_f32(&state, &trajectory.positions)),
+            velocities: Some(arrays::from_f32(&state, &trajectory.velocities)),
+            landmarks: Some(arrays::from_f32(&[b, s.landmarks, s.dims], &trajectory.landmarks)),
+            goals: Some(arrays::from_u32(&[b, n, s.targets], &trajectory.goals)),
+            actions: Some(arrays::from_u8(&[t, b, n, s.heads], &trajectory.actions)),
+            log_probs: Some(arrays::from_f32(&[t, b, n], &trajectory.log_probs)),
+            rewards: Some(arrays::from_f32(&[t, b, n], &trajectory.rewards)),
+            goal_log_probs: Some(arrays::from_f32(&[b], &trajectory.goal_log_probs)),
+            costs: Some(arrays::from_f32(&[b], &trajectory.costs)),
+            exact_costs: Some(arrays::from_f32(&[b], &trajectory.exact_costs)),
+            metrics: trajectory.metrics.iter().map(Into::into).collect(),
+        }
+    }
+}
+
+fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, ConvertError> {
+    let shape = Shape::from(message.shape.as_ref().ok_or_else(|| ConvertError::missing("shape"))?);
+    let s = &shape;
+    let (t, b, n) = (s.steps, s.episodes, s.agents);
+    let state = [t + 1, b, s.bodies, s.dims];
+    Ok(Trajectory {
+        shard,
+        shape,
+        positions: arrays::to_f32("positions", message.positions, &state)?,
+        velocities: arrays::to_f32("velocities", message.velocities, &state)?,
+        landmarks: arrays::to_f32("landmarks", message.landmarks, &[b, s.landmarks, s.dims])?,
+        goals: arrays::to_u32("goals", message.goals, &[b, n, s.targets])?,
+        actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.heads])?,
+        log_probs: arrays::to_f32("log_probs", message.log_probs, &[t, b, n])?,
+        rewards: arrays::to_f32("rewards", message.rewards, &[t, b, n])?,
+        goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b])?,
+        costs: arrays::to_f32("costs", message.costs, &[b])?,
+        exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b])?,
+        metrics: message.metrics.iter().map(Into::into).collect(),
+    })
+}
+
+impl From<&Recording> for v1::Recording {
+    fn from(recording: &Recording) -> Self {
+        let s = &recording.shape;
+        Self {
+            shape: Some(s.into()),
+            positions: Some(arrays::from_f32(&[s.steps + 1, s.bodies, s.dims], &recording.positions)),
+            landmarks: Some(arrays::from_f32(&[s.landmarks, s.dims], &recording.landmarks)),
+            goals: Some(arrays::from_u32(&[s.agents, s.targets], &recording.goals)),
+        }
+    }
+}
+
+impl TryFrom<v1::Recording> for Recording {
+    type Error = ConvertError;
+    fn try_from(message: v1::Recording) -> Result<Self, ConvertError> {
+        let shape = Shape::from(message.shape.as_ref().ok_or_else(|| ConvertError::missing("shape"))?);
+        let s = &shape;
+        Ok(Self {
+            shape,
+            positions: arrays::to_f32("positions", message.positions, &[s.steps + 1, s.bodies, s.dims])?,
+            landmarks: arrays::to_f32("landmarks", message.landmarks, &[s.landmarks, s.dims])?,
+            goals: arrays::to_u32("goals", message.goals, &[s.agents, s.targets])?,
+        })
+    }
+}
+
+/// A result as it came in: what it is, and what it claims to be made with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Delivery {
+    /// Run that it belongs to.
+    pub run_id: RunId,
+    /// SHA-256 (hex) of the weights that were used.
+    pub weights_sha256: String,
+    /// The result.
+    pub result: ShardResult,
+}
+
+/// Encodes a result for the wire.
+pub fn encode_result(run_id: &RunId, weights_sha256: &str, result: &ShardResult) -> Bytes {
+    let body = match result {
+        ShardResult::Train(trajectory) => v1::shard_result::Result::Trajectory(trajectory.into()),
+        ShardResult::Eval(outcome) => v1::shard_result::Result::Eval(v1::EvalOutcome {
+            metrics: outcome.metrics.iter().map(Into::into).collect(),
+            recording: outcome.recording.as_ref().map(Into::into),
+        }),
+    };
+    let message = v1::ShardResult {
+        run_id: run_id.0.clone(),
+        shard: Some(result.shard().into()),
+        weights_sha256: weights_sha256.to_owned(),
+        result: Some(body),
+    };
+    message.encode_to_vec().into()
+}
+
+/// Decodes a result. Shapes agree with the arrays afterwards; the numbers themselves are not looked at.
+pub fn decode_result(bytes: Bytes) -> Result<Delivery, ConvertError> {
+    let message = v1::ShardResult::decode(bytes).map_err(|error| ConvertError::new("result", error.to_string()))?;
+    let shard = shard("shard", message.shard.as_ref())?;
+    let result = match message.result {
+        Some(v1::shard_result::Result::Trajectory(body)) => {
+            ShardResult::Train(trajectory(shard, body).map_err(|error| error.within("trajectory"))?)
+        }
+        Some(v1::shard_result::Result::Eval(body)) => ShardResult::Eval(EvalOutcome {
+            shard,
+            metrics: body.metrics.iter().map(Into::into).collect(),
+            recording: body.recording.map(Recording::try_from).transpose().map_err(|e| e.within("eval.recording"))?,
+        }),
+        None => return Err(ConvertError::missing("result")),
+    };
+    Ok(Delivery { run_id: RunId(message.run_id), weights_sha256: message.weights_sha256, result })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,218 @@
+//! What an actor asks of the commander, and the answer.
+
+use crate::convert::{self, ConvertError};
+use crate::{arrays, v1};
+use magex_core::ids::{RunId, Shard, WeightsVersion};
+use std::fmt;
+
+/// What hands out goals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum SchedulerKind {
+    /// The trained Goal Commander.
+    #[default]
+    Learned,
+    /// The least summed distance.
+    Exact,
+    /// The nearest free pair, again and again.
+    Greedy,
+    /// A uniformly random matching.
+    Random,
+}
+
+impl fmt::Display for SchedulerKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Learned => "learned",
+            Self::Exact => "exact",
+            Self::Greedy => "greedy",
+            Self::Random => "random",
+        })
+    }
+}
+
+impl From<SchedulerKind> for v1::SchedulerKind {
+    fn from(kind: SchedulerKind) -> Self {
+        match kind {
+            SchedulerKind::Learned => Self::Learned,
+            SchedulerKind::Exact => Self::Exact,
+            SchedulerKind::Greedy => Self::Greedy,
+            SchedulerKind::Random => Self::Random,
+        }
+    }
+}
+
+impl From<v1::SchedulerKind> for SchedulerKind {
+    fn from(kind: v1::SchedulerKind) -> Self {
+        match kind {
+            v1::SchedulerKind::Unspecified | v1::SchedulerKind::Learned => Self::Learned,
+            v1::SchedulerKind::Exact => Self::Exact,
+            v1::SchedulerKind::Greedy => Self::Greedy,
+            v1::SchedulerKind::Random => Self::Random,
+        }
+    }
+}
+
+/// Which weights are to answer.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct WeightsKey {
+    /// Run that they belong to.
+    pub run_id: RunId,
+    /// Their version.
+    pub version: WeightsVersion,
+    /// SHA-256 of their bytes, lower-case hex.
+    pub sha256: String,
+}
+
+/// The teams of one shard. What is random in the answer is keyed by (seed, shard), so that the answer is a pure function of
+/// the request and the weights that `shard.version` names.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GoalRequest {
+    /// The shard: kind, iteration, index, set and first episode are keys; version and mode are orders.
+    pub shard: Shard,
+    /// Seed of the run.
+    pub seed: u64,
+    /// What hands out the goals.
+    pub scheduler: SchedulerKind,
+    /// N: agents per episode.
+    pub agent_count: usize,
+    /// G: goals per episode.
+    pub goal_count: usize,
+    /// D: space dimensions.
+    pub dims: usize,
+    /// [B, N, D] world units, with B = `shard.episodes`.
+    pub agents: Vec<f32>,
+    /// [B, G, D] world units.
+    pub goals: Vec<f32>,
+}
+
+/// The assignments of one shard.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GoalReply {
+    /// [B, N] the goal of each agent.
+    pub goals: Vec<u32>,
+    /// [B] log-probability of each episode's assignment (0 unless learned).
+    pub log_probs: Vec<f32>,
+    /// [B] summed distance of each episode's assignment, world units.
+    pub costs: Vec<f32>,
+    /// [B] least summed distance possible, world units.
+    pub exact_costs: Vec<f32>,
+}
+
+impl GoalRequest {
+    /// The message that asks these weights.
+    pub fn to_message(&self, weights: &WeightsKey) -> v1::AssignBatchRequest {
+        let b = self.shard.episodes as usize;
+        v1::AssignBatchRequest {
+            run_id: weights.run_id.0.clone(),
+            sha256: weights.sha256.clone(),
+            seed: self.seed,
+            shard: Some((&self.shard).into()),
+            scheduler: v1::SchedulerKind::from(self.scheduler).into(),
+            agents: Some(arrays::from_f32(&[b, self.agent_count, self.dims], &self.agents)),
+            goals: Some(arrays::from_f32(&[b, self.goal_count, self.dims], &self.goals)),
+        }
+    }
+
+    /// Reads a message: the request, and the weights that are to answer. Positions are finite afterwards.
+    pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), ConvertError> {
+        let shard = convert::shard("shard", message.shard.as_ref())?;
+        let scheduler = message.scheduler().into();
+        let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 3)?;
+        let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 3)?;
+        let (b, dims) = (shard.episodes as usize, agent_shape[2]);
+        let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, agent_shape[1], dims])?)?;
+        let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, goal_shape[1], dims])?)?;
+        let (agent_count, goal_count) = (agent_shape[1], goal_shape[1]);
+        let version = shard.version;
+        let request = Self { shard, seed: message.seed, scheduler, agent_count, goal_count, dims, agents, goals };
+        Ok((request, WeightsKey { run_id: RunId(message.run_id), version, sha256: message.sha256 }))
+    }
+}
+
+impl GoalReply {
+    /// The message of a reply for B episodes of N agents.
+    pub fn to_message(&self, episodes: usize, agents: usize, version: WeightsVersion) -> v1::AssignBatchResponse {
+        v1::AssignBatchResponse {
+            goals: Some(arrays::from_u32(&[episodes, agents], &self.goals)),
+            log_probs: Some(arrays::from_f32(&[episodes], &self.log_probs)),
+            costs: Some(arrays::from_f32(&[episodes], &self.costs)),
+            exact_costs: Some(arrays::from_f32(&[episodes], &self.exact_costs)),
+            version: version.0,
+        }
+    }
+
+    /// Reads the answer to a request: shapes fit, numbers are finite, and goals exist.
+    pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, ConvertError> {
+        let b = request.shard.episodes as usize;
+        if message.version != request.shard.version.0 {
+            let problem = format!("version {} answered, {} was asked", message.version, request.shard.version);
+            return Err(ConvertError::new("version", problem));
+        }
+        let goals = arrays::to_u32("goals", message.goals, &[b, request.agent_count])?;
+        if let Some(goal) = goals.iter().find(|&&goal| goal as usize >= request.goal_count) {
+            return Err(ConvertError::new("goals", format!("{goal} is not below {}", request.goal_count)));
+        }
+        Ok(Self {
+            goals,
+            log_probs: finite("log_probs", arrays::to_f32("log_probs", message.log_probs, &[b])?)?,
+            costs: finite("costs", arrays::to_f32("costs", message.costs, &[b])?)?,
+            exact_costs: finite("exact_costs", arrays::to_f32("exact_costs", message.exact_costs, &[b])?)?,
+        })
+    }
+}
+
+fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, ConvertError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(place) => Err(ConvertError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
+        None => Ok(values),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::ids::{Iteration, Mode, ShardKind};
+
+    fn request() -> GoalRequest {
+        let shard = Shard {
+            kind: ShardKind::Train,
+            iteration: Iteration(1),
+            index: 2,
+            episodes: 2,
+            first_episode: 4,
+            version: WeightsVersion(1),
+            mode: Mode::Sampled,
+            eval_set: 0,
+            record: false,
+        };
+        let points: Vec<f32> = (0..8).map(|i| i as f32).collect();
+        let (seed, scheduler, goals) = (5, SchedulerKind::Exact, points.clone());
+        GoalRequest { shard, seed, scheduler, agent_count: 2, goal_count: 2, dims: 2, agents: points, goals }
+    }
+
+    #[test]
+    fn request_and_reply_round_trip() {
+        let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
+        let back = GoalRequest::from_message(request().to_message(&key)).unwrap();
+        assert_eq!(back, (request(), key));
+        let reply = GoalReply {
+            goals: vec![1, 0, 0, 1],
+            log_probs: vec![-1.0, 0.0],
+            costs: vec![2.0, 3.0],
+            exact_costs: vec![2.0, 2.5],
+        };
+        let message = reply.to_message(2, 2, WeightsVersion(1));
+        assert_eq!(GoalReply::from_message(message.clone(), &request()).unwrap(), reply);
+        let other = v1::AssignBatchResponse { version: 2, ..message };
+        assert!(GoalReply::from_message(other, &request()).unwrap_err().to_string().contains("version 2 answered"));
+    }
+
+    #[test]
+    fn a_position_that_is_not_a_number_is_named() {
+        let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
+        let mut bad = request();
+        bad.goals[3] = f32::NAN;
+        let error = GoalRequest::from_message(bad.to_message(&key)).unwrap_err();
+        assert_eq!(error.to_string(), "goals[3]: NaN is not finite");
+    }
+}

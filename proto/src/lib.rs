@@ -1,0 +1,31 @@
+//! The wire and nothing else: messages, services, and the conversions between them and the domain types.
+//!
+//! Arrays travel as little-endian bytes. A result or a set of weights is cut into parts ([`parts`]) so that no message
+//! comes near [`MAX_MESSAGE_BYTES`].
+
+pub mod arrays;
+pub mod convert;
+pub mod goals;
+pub mod parts;
+pub mod weights;
+
+/// Generated from `proto/magex/v1`.
+#[allow(missing_docs, unreachable_pub, clippy::all)]
+pub mod v1 {
+    tonic::include_proto!("magex.v1");
+}
+
+/// Version of the protocol that this build speaks; both sides of a handshake must agree on it.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// Longest message that any side decodes, bytes.
+pub const MAX_MESSAGE_BYTES: usize = 2 << 20;
+
+/// Longest message between actors and commander, bytes: the positions of a shard's episodes travel whole.
+pub const MAX_BATCH_BYTES: usize = 32 << 20;
+
+/// Longest payload of a part, bytes: with its envelope it stays within a mebibyte.
+pub const PART_BYTES: usize = (1 << 20) - 4096;
+
+/// Descriptors of all files, encoded, for server reflection.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/magex_descriptor.bin"));

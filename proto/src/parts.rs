@@ -1,0 +1,168 @@
+//! Long byte strings as a sequence of parts, each with its own checksum, and back within a limit.
+
+use crate::{PART_BYTES, v1::Part};
+use bytes::Bytes;
+
+/// Why parts do not make a whole.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PartError {
+    /// The whole would be longer than allowed.
+    #[error("total_bytes: {total} bytes are more than the limit of {limit}")]
+    TooLong {
+        /// Announced length, bytes.
+        total: u64,
+        /// Limit, bytes.
+        limit: usize,
+    },
+    /// The parts do not follow each other.
+    #[error("index: part {index} of {total} where part {expected} is expected")]
+    OutOfOrder {
+        /// Index of the part.
+        index: u32,
+        /// Announced number of parts.
+        total: u32,
+        /// Index that was expected.
+        expected: u32,
+    },
+    /// The parts disagree about the whole, or do not fill it.
+    #[error("data: {0}")]
+    Inconsistent(String),
+    /// The data were changed on their way.
+    #[error("crc32c: part {index} has checksum {actual:08x}, its sender says {claimed:08x}")]
+    Checksum {
+        /// Index of the part.
+        index: u32,
+        /// Checksum of the data that arrived.
+        actual: u32,
+        /// Checksum that the sender gave.
+        claimed: u32,
+    },
+}
+
+/// Cuts a byte string into parts of at most [`PART_BYTES`]; an empty one is a single empty part. Shares the bytes.
+pub fn split(whole: Bytes) -> impl ExactSizeIterator<Item = Part> {
+    let total = whole.len().div_ceil(PART_BYTES).max(1);
+    let total_bytes = whole.len() as u64;
+    (0..total).map(move |index| {
+        let data = whole.slice(index * PART_BYTES..whole.len().min((index + 1) * PART_BYTES));
+        Part { index: index as u32, total: total as u32, total_bytes, crc32c: crc32c::crc32c(&data), data }
+    })
+}
+
+/// Puts parts together again, one byte string at a time. Any error, and any part 0, begins anew.
+#[derive(Debug)]
+pub struct Assembler {
+    limit: usize,
+    next: u32,
+    total: u32,
+    total_bytes: u64,
+    buffer: Vec<u8>,
+}
+
+impl Assembler {
+    /// An assembler for byte strings of at most `limit` bytes.
+    pub fn new(limit: usize) -> Self {
+        Self { limit, next: 0, total: 0, total_bytes: 0, buffer: Vec::new() }
+    }
+
+    /// Takes the next part; the last one gives the whole.
+    pub fn push(&mut self, part: Part) -> Result<Option<Bytes>, PartError> {
+        let taken = self.take(part);
+        if !matches!(taken, Ok(None)) {
+            *self = Self::new(self.limit);
+        }
+        taken
+    }
+
+    fn take(&mut self, part: Part) -> Result<Option<Bytes>, PartError> {
+        if part.index == 0 {
+            if part.total_bytes > self.limit as u64 {
+                return Err(PartError::TooLong { total: part.total_bytes, limit: self.limit });
+            }
+            *self = Self { total: part.total, total_bytes: part.total_bytes, ..Self::new(self.limit) };
+        } else if part.index != self.next {
+            return Err(PartError::OutOfOrder { index: part.index, total: part.total, expected: self.next });
+        }
+        if (part.total, part.total_bytes) != (self.total, self.total_bytes) || part.index >= part.total {
+            return Err(PartError::Inconsistent(format!(
+                "part {} speaks of {} parts and {} bytes, part 0 of {} and {}",
+                part.index, part.total, part.total_bytes, self.total, self.total_bytes
+            )));
+        }
+        let actual = crc32c::crc32c(&part.data);
+        if actual != part.crc32c {
+            return Err(PartError::Checksum { index: part.index, actual, claimed: part.crc32c });
+        }
+        let last = part.index + 1 == part.total;
+        let length = (self.buffer.len() + part.data.len()) as u64;
+        if length > self.total_bytes || (last && length != self.total_bytes) {
+            return Err(PartError::Inconsistent(format!("{length} bytes arrived of {} announced", self.total_bytes)));
+        }
+        if last && part.index == 0 {
+            return Ok(Some(part.data));
+        }
+        if part.index == 0 {
+            self.buffer.reserve_exact(self.total_bytes as usize);
+        }
+        self.buffer.extend_from_slice(&part.data);
+        self.next = part.index + 1;
+        Ok(last.then(|| std::mem::take(&mut self.buffer).into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn whole(length: usize) -> Bytes {
+        (0..length).map(|i| (i * 31 % 251) as u8).collect::<Vec<_>>().into()
+    }
+
+    fn join(assembler: &mut Assembler, parts: impl IntoIterator<Item = Part>) -> Result<Option<Bytes>, PartError> {
+        let mut last = Ok(None);
+        for part in parts {
+            last = assembler.push(part);
+            if last.is_err() {
+                break;
+            }
+        }
+        last
+    }
+
+    #[test]
+    fn every_length_round_trips_within_the_part_limit() {
+        let mut assembler = Assembler::new(4 * PART_BYTES);
+        for length in [0, 1, PART_BYTES - 1, PART_BYTES, PART_BYTES + 1, 3 * PART_BYTES, 3 * PART_BYTES + 7] {
+            let whole = whole(length);
+            assert!(split(whole.clone()).all(|part| part.data.len() <= PART_BYTES));
+            assert_eq!(join(&mut assembler, split(whole.clone())).unwrap(), Some(whole), "{length}");
+        }
+    }
+
+    #[test]
+    fn a_whole_over_the_limit_is_refused_at_its_first_part() {
+        let error = Assembler::new(100).push(split(whole(101)).next().unwrap()).unwrap_err();
+        assert_eq!(error, PartError::TooLong { total: 101, limit: 100 });
+    }
+
+    #[test]
+    fn damage_is_noticed_and_the_next_whole_is_unharmed() {
+        let mut assembler = Assembler::new(4 * PART_BYTES);
+        let good = whole(2 * PART_BYTES);
+        let parts: Vec<Part> = split(good.clone()).collect();
+        let check = |assembler: &mut Assembler, damage: fn(&mut Vec<Part>), words: &str| {
+            let mut parts = parts.clone();
+            damage(&mut parts);
+            let error = join(assembler, parts).unwrap_err().to_string();
+            assert!(error.contains(words), "{error}");
+            assert_eq!(join(assembler, split(good.clone())).unwrap(), Some(good.clone()));
+        };
+        check(&mut assembler, |p| p[1].crc32c ^= 1, "checksum");
+        check(&mut assembler, |p| p[1].data = p[1].data.slice(1..), "checksum");
+        check(&mut assembler, |p| p.swap(0, 1), "part 1 of 2 where part 0 is expected");
+        check(&mut assembler, |p| p[1].total = 3, "speaks of 3 parts");
+        check(&mut assembler, |p| p.iter_mut().for_each(|p| p.total_bytes -= 1), "announced");
+        check(&mut assembler, |p| p.iter_mut().for_each(|p| p.total_bytes += 1), "announced");
+        check(&mut assembler, |p| p.iter_mut().for_each(|p| p.total = 0), "speaks of 0 parts");
+    }
+}

@@ -1,0 +1,78 @@
+//! Stopping: within the budget, whoever hangs on, and with everybody told.
+
+use crate::sandbox::*;
+use magex_core::ids::Iteration;
+use magex_learner::collector::{CollectError, Collector as _, IterationReport, RunEvent, StopReason};
+use magex_proto::v1;
+use magex_proto::v1::watch_run_response::Event;
+use std::time::{Duration, Instant};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn open_streams_and_idle_sockets_do_not_hold_up_the_end() {
+    let mut learner = Learner::start().await;
+    learner.collector.publish(&weights(0)).unwrap();
+    learner.collector.open(plan(0, 1)).unwrap();
+    let mut client = learner_client(&learner.url).await;
+    let _weights = client.watch_weights(v1::WatchWeightsRequest::default()).await.unwrap();
+    let _events = client.watch_run(v1::WatchRunRequest {}).await.unwrap();
+    let mut puppet = Puppet::ready(&learner.url, 1, 1).await;
+    puppet.lease().await;
+    let _idle = tokio::net::TcpStream::connect(learner.address).await.unwrap();
+
+    let start = Instant::now();
+    let Learner { shutdown, serving, mut collector, .. } = learner;
+    let trainer = tokio::task::spawn_blocking(move || collector.wait());
+    shutdown.cancel();
+    assert!(matches!(within(trainer).await.unwrap(), Err(CollectError::Stopped(StopReason::Shutdown))));
+    let farewell = puppet.next().await.unwrap();
+    assert!(matches!(farewell, v1::rollout_response::Message::Drain(v1::Drain { finished: false, .. })));
+    within(serving).await.unwrap();
+    assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
+    let mut learner = Learner::start().await;
+    let actor = Actor::start(&learner.url, "a", FakeWorker::default());
+    learner.iterate(0, 2).await.unwrap();
+    let report = IterationReport {
+        iteration: Iteration(0),
+        joint_env_steps: 12,
+        success: Some(0.5),
+        reward: None,
+        metrics_json: "{\"x\":1}".into(),
+    };
+    learner.collector.event(RunEvent::Iteration(report));
+    let status = learner.handle.status();
+    assert_eq!((status.iteration, status.joint_env_steps, status.success), (1, 12, Some(0.5)));
+    let mut client = learner_client(&learner.url).await;
+    let mut events = client.watch_run(v1::WatchRunRequest {}).await.unwrap().into_inner();
+    let first = within(events.message()).await.unwrap().unwrap();
+    assert!(matches!(first.event, Some(Event::Iteration(event)) if event.metrics_json == "{\"x\":1}"));
+    learner.collector.event(RunEvent::Finished { summary_json: "{}".into() });
+    assert_eq!(learner.handle.status().state(), v1::RunState::Finished);
+    learner.shutdown.cancel();
+    assert!(matches!(within(events.message()).await.unwrap().unwrap().event, Some(Event::Finished(_))));
+    assert!(within(events.message()).await.unwrap().is_none());
+    assert_eq!(actor.end().await.unwrap().accepted, 2);
+    learner.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drain_lets_the_iteration_finish() {
+    let mut learner = Learner::start().await;
+    learner.collector.publish(&weights(0)).unwrap();
+    learner.collector.open(plan(0, 2)).unwrap();
+    assert_eq!(learner.handle.status().state(), v1::RunState::WaitingForActors);
+    let mut client = learner_client(&learner.url).await;
+    client.checkpoint(v1::CheckpointRequest {}).await.unwrap();
+    client.drain(v1::DrainRequest { reason: "new kernel".into() }).await.unwrap();
+    let actor = Actor::start(&learner.url, "a", FakeWorker::default());
+    assert_eq!(learner.finish().await.unwrap(), expected(&plan(0, 2)));
+    assert_eq!(learner.collector.stop_requested(), Some(StopReason::Drain("new kernel".into())));
+    assert!(learner.collector.checkpoint_requested() && !learner.collector.checkpoint_requested());
+    let status = client.get_run(v1::GetRunRequest {}).await.unwrap().into_inner().run.unwrap();
+    assert_eq!(status.state(), v1::RunState::Draining);
+    actor.stop().await;
+    learner.stop().await;
+}
