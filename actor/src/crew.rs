@@ -60,8 +60,7 @@ impl Crew {
         let queue = Arc::new(Mutex::new(queue));
         let cancelled = CancellationToken::new();
         let cache = tools.cache.clone();
-        let mut crew =
-            Self { welcome, jobs: Some(jobs), outcomes, cancelled, cache, threads: Vec::new(), busy: 0 };
+        let mut crew = Self { welcome, jobs: Some(jobs), outcomes, cancelled, cache, threads: Vec::new(), busy: 0 };
         for number in 0..threads {
             let bench = Bench {
                 worker: (tools.make_worker)(&crew.welcome)?,

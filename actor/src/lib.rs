@@ -7,3 +7,5 @@ mod link;
 pub mod run;
 mod weights_feed;
 pub mod worker;
+pub mod cli;
+pub mod policy;

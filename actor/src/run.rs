@@ -135,7 +135,11 @@ impl Actor {
                 }
                 End::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
                 End::Broken(reason) => {
-                    tracing::warn!(reason, url = self.config.learner_url, "no learner; trying again until there is one");
+                    tracing::warn!(
+                        reason,
+                        url = self.config.learner_url,
+                        "no learner; trying again until there is one"
+                    );
                     waiting = true;
                 }
             }

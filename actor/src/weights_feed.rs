@@ -22,12 +22,7 @@ pub(crate) async fn follow(channel: Channel, actor_id: String, cache: Arc<Weight
     }
 }
 
-async fn watch(
-    channel: Channel,
-    actor_id: &str,
-    cache: &WeightsCache,
-    backoff: &mut Backoff,
-) -> Result<(), Status> {
+async fn watch(channel: Channel, actor_id: &str, cache: &WeightsCache, backoff: &mut Backoff) -> Result<(), Status> {
     let mut client = LearnerServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let request = v1::WatchWeightsRequest {
         run_id: String::new(),

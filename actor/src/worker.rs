@@ -25,12 +25,7 @@ pub struct Welcome {
 /// Turns shards into results. Lives on one rollout thread; keeps nothing that a result could depend on.
 pub trait Worker: Send {
     /// Does one shard with the weights that it names.
-    fn work(
-        &mut self,
-        shard: &Shard,
-        weights: &Weights,
-        goals: &mut dyn GoalSource,
-    ) -> Result<ShardResult, WorkError>;
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError>;
 }
 
 /// Why a shard did not get done.

@@ -35,7 +35,10 @@ pub(crate) fn read(message: v1::AssignRequest, seed: u64) -> Result<Team, Conver
         [("agent_ids", &message.agent_ids, agent_count), ("goal_ids", &message.goal_ids, goal_count)]
     {
         if !ids.is_empty() && ids.len() != count {
-            return Err(ConvertError::new(field, format!("{} names for {count} points; give one each or none", ids.len())));
+            return Err(ConvertError::new(
+                field,
+                format!("{} names for {count} points; give one each or none", ids.len()),
+            ));
         }
     }
     let seed = message.seed.unwrap_or(seed);
@@ -152,10 +155,8 @@ mod tests {
     fn both_forms_of_positions_are_read_alike() {
         let plain = request(&[0.0, 0.0, 1.0, 0.0], &[1.0, 1.0]);
         let mut packed = plain.clone();
-        packed.agents = Some(v1::Positions {
-            array: Some(arrays::from_f32(&[2, 2], &[0.0, 0.0, 1.0, 0.0])),
-            ..Default::default()
-        });
+        packed.agents =
+            Some(v1::Positions { array: Some(arrays::from_f32(&[2, 2], &[0.0, 0.0, 1.0, 0.0])), ..Default::default() });
         assert_eq!(read(plain, 1).unwrap(), read(packed, 1).unwrap());
     }
 

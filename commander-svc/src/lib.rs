@@ -6,3 +6,5 @@ pub mod scheduler;
 pub mod service;
 mod store;
 mod subscription;
+pub mod cli;
+pub mod trained;

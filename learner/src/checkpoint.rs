@@ -240,3 +240,6 @@ pub fn read_latest(
         _ => Err(CheckpointError::None(run.to_owned())),
     }
 }
+
+#[cfg(test)]
+mod tests;

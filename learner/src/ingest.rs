@@ -189,7 +189,8 @@ mod tests {
         check(|t| t.metrics[1].reward = f32::NAN, "trajectory.metrics[1].reward: NaN");
         check(|t| t.shard.episodes = 5, "shard.episodes: 5 is outside 1..=4");
         check(|t| t.shard.episodes = 1, "trajectory.shape: ");
-        let other = encode_result(&RunId("other".into()), "", &ShardResult::Train(trajectory(&task(), train_shard(0, 0, 1))));
+        let other =
+            encode_result(&RunId("other".into()), "", &ShardResult::Train(trajectory(&task(), train_shard(0, 0, 1))));
         assert!(admit(&limits(), &RunId("r".into()), other).unwrap_err().to_string().contains("'other' where 'r'"));
     }
 
@@ -199,7 +200,8 @@ mod tests {
         let outcome = eval_outcome(&task(), shard, false);
         assert!(verdict(ShardResult::Eval(outcome)).is_ok());
         shard.record = true;
-        let error = verdict(ShardResult::Eval(EvalOutcome { shard, ..eval_outcome(&task(), shard, false) })).unwrap_err();
+        let error =
+            verdict(ShardResult::Eval(EvalOutcome { shard, ..eval_outcome(&task(), shard, false) })).unwrap_err();
         assert_eq!(error, "eval.recording: missing");
     }
 }

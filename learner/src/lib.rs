@@ -19,3 +19,4 @@ mod session;
 mod state;
 pub mod trainer;
 pub mod weights;
+pub mod cli;

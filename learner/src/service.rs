@@ -67,9 +67,9 @@ impl LearnerHandle {
     pub async fn serve(&self, incoming: TcpIncoming, shutdown: CancellationToken) -> Result<(), ServeError> {
         let (health, health_service) = Health::new::<LearnerServiceServer<LearnerApi>>().await;
         let api = LearnerApi { shared: self.shared.clone() };
-        let router = server::builder().add_service(health_service).add_service(
-            LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES),
-        );
+        let router = server::builder()
+            .add_service(health_service)
+            .add_service(LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES));
         let router = server::with_reflection(router, FILE_DESCRIPTOR_SET)?;
         let shared = self.shared.clone();
         let stopped = shutdown.clone();
@@ -161,19 +161,13 @@ impl LearnerService for LearnerApi {
 
     type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse, Status>>;
 
-    async fn watch_run(
-        &self,
-        _: Request<v1::WatchRunRequest>,
-    ) -> Result<Response<Self::WatchRunStream>, Status> {
+    async fn watch_run(&self, _: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
         let (reader, stream) = mpsc::channel(64);
         tokio::spawn(self.shared.events.clone().stream(reader, self.shared.closing.clone()));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn checkpoint(
-        &self,
-        _: Request<v1::CheckpointRequest>,
-    ) -> Result<Response<v1::CheckpointResponse>, Status> {
+    async fn checkpoint(&self, _: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointResponse>, Status> {
         self.check_open()?;
         self.shared.request_checkpoint();
         Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.current_iteration() }))

@@ -162,7 +162,8 @@ impl Session {
             End::Left => tracing::info!(actor, lost, "actor left"),
             End::Silent => {
                 tracing::warn!(actor, lost, rejected, "actor fell silent; its leases go to others");
-                let problem = format!("nothing heard for {:?}; the leases are given to others", self.shared.lease_time());
+                let problem =
+                    format!("nothing heard for {:?}; the leases are given to others", self.shared.lease_time());
                 let _ = self.outbound.try_send(Err(Status::deadline_exceeded(problem)));
             }
             End::Replaced => tracing::info!(actor, lost, "actor connected again"),

@@ -48,7 +48,10 @@ pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u
 pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, ConvertError> {
     let array = array.ok_or_else(|| ConvertError::missing(field))?;
     if array.shape.len() != axes {
-        return Err(ConvertError::new(field, format!("shape {:?} has {} axes, not {axes}", array.shape, array.shape.len())));
+        return Err(ConvertError::new(
+            field,
+            format!("shape {:?} has {} axes, not {axes}", array.shape, array.shape.len()),
+        ));
     }
     Ok(array.shape.iter().map(|&extent| extent as usize).collect())
 }

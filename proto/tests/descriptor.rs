@@ -70,7 +70,10 @@ fn the_contract_is_the_committed_one() {
         std::fs::write(path, &now).unwrap();
     }
     let committed = std::fs::read_to_string(path).unwrap_or_default();
-    assert!(now == committed, "the wire changed; fields are only ever added. Review, then rewrite with UPDATE_EXPECT=1:\n{now}");
+    assert!(
+        now == committed,
+        "the wire changed; fields are only ever added. Review, then rewrite with UPDATE_EXPECT=1:\n{now}"
+    );
 }
 
 #[test]

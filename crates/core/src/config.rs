@@ -246,7 +246,7 @@ impl Default for CommanderConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MappoConfig {
-    /// Episodes per iteration.
+    /// Episodes per iteration; 0 means about 400 agents' worth: 64 for N = 5, 20 for N = 20, 8 from N = 50 on.
     pub episodes: u32,
     /// S: shards that an iteration's episodes are cut into; must divide `episodes`.
     pub shards: u32,
@@ -287,7 +287,7 @@ pub struct MappoConfig {
 impl Default for MappoConfig {
     fn default() -> Self {
         Self {
-            episodes: 8,
+            episodes: 0,
             shards: 4,
             gamma: 0.99,
             gae_lambda: 0.95,
@@ -310,13 +310,14 @@ impl Default for MappoConfig {
 }
 
 impl Default for RunConfig {
+    /// Simple Spread with 50 agents, MAGE-X.
     fn default() -> Self {
         Self {
             run: RunSection::default(),
             task: default_task(),
             executor: ExecutorConfig::default(),
             commander: CommanderConfig::default(),
-            mappo: MappoConfig::default(),
+            mappo: MappoConfig { episodes: 8, ..MappoConfig::default() },
         }
     }
 }
@@ -331,6 +332,11 @@ impl RunConfig {
     /// Fills in what "0 means default" stands for, and checks every range.
     pub fn resolved(mut self) -> Result<Self, ConfigError> {
         self.task = self.task.resolved();
+        if self.mappo.episodes == 0 {
+            let shards = self.mappo.shards.max(1);
+            let wanted = (400 / self.task.agents.max(1) as u32).clamp(8, 64);
+            self.mappo.episodes = wanted.next_multiple_of(shards);
+        }
         self.validate()?;
         Ok(self)
     }

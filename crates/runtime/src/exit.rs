@@ -1,4 +1,6 @@
-//! Exit codes, as in sysexits.h.
+//! Exit codes, as in sysexits.h, and the end of a command.
+
+use std::process::ExitCode;
 
 /// Everything went well.
 pub const OK: u8 = 0;
@@ -16,3 +18,51 @@ pub const CANNOT_CREATE: u8 = 73;
 pub const TEMPORARY: u8 = 75;
 /// Interrupted twice.
 pub const INTERRUPTED: u8 = 130;
+
+/// Why a command failed, and the exit code that says so.
+#[derive(Debug, thiserror::Error)]
+#[error("{message}")]
+pub struct Failure {
+    /// Exit code.
+    pub code: u8,
+    /// What to tell the user.
+    pub message: String,
+}
+
+impl Failure {
+    /// A failure with its exit code.
+    pub fn new(code: u8, message: impl ToString) -> Self {
+        Self { code, message: message.to_string() }
+    }
+
+    /// Wrong usage or configuration.
+    pub fn usage(message: impl ToString) -> Self {
+        Self::new(USAGE, message)
+    }
+}
+
+/// Runs a command's body with the arguments of this process: usage errors exit with [`USAGE`], failures are told on
+/// standard error and exit with their code.
+pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> ExitCode {
+    let arguments = match P::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // Help and version are no errors. A closed terminal does not matter.
+            let _ = error.print();
+            return ExitCode::from(if error.use_stderr() { USAGE } else { OK });
+        }
+    };
+    report(body(arguments))
+}
+
+/// The exit code of a result; a failure is told on standard error.
+#[allow(clippy::print_stderr, reason = "the one place that tells why a command failed")]
+pub fn report(result: Result<u8, Failure>) -> ExitCode {
+    match result {
+        Ok(code) => ExitCode::from(code),
+        Err(failure) => {
+            eprintln!("error: {failure}");
+            ExitCode::from(failure.code)
+        }
+    }
+}

@@ -43,7 +43,25 @@ pub fn ready_line(service: &str, address: Option<SocketAddr>) -> String {
     )
 }
 
-/// Prints [`ready_line`] to standard output: the only thing a service ever writes there.
+/// A name for this process that means something to a person: host and process number.
+pub fn default_name() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let host = if host.trim().is_empty() { "host" } else { host.trim() };
+    format!("{host}-{}", std::process::id())
+}
+
+/// The processors that this process may use.
+pub fn processors() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// Writes text that was asked for (an effective configuration) to standard output.
+pub fn print(text: &str) {
+    // A reader that closed the pipe does not want to know.
+    let _ = std::io::stdout().lock().write_all(text.as_bytes());
+}
+
+/// Prints [`ready_line`] to standard output: the only thing a running service ever writes there.
 pub fn announce_ready(service: &str, address: Option<SocketAddr>) {
     let mut stdout = std::io::stdout().lock();
     // A supervisor that closed the pipe does not want to know.

@@ -39,11 +39,11 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
     (shards(), [1usize..4, 1..4, 1..4, 1..4, 1..3]).prop_flat_map(|(shard, [t, n, extra, d, k])| {
         let b = shard.episodes as usize;
         let (e, h) = (n + extra, k);
-        let shape =
-            Shape { steps: t, episodes: b, agents: n, bodies: e, landmarks: n, dims: d, targets: k, heads: h };
+        let shape = Shape { steps: t, episodes: b, agents: n, bodies: e, landmarks: n, dims: d, targets: k, heads: h };
         let state = (t + 1) * b * e * d;
         let states = (floats(state), floats(state), floats(b * n * d));
-        let choices = (prop::collection::vec(any::<u32>(), b * n * k), prop::collection::vec(any::<u8>(), t * b * n * h));
+        let choices =
+            (prop::collection::vec(any::<u32>(), b * n * k), prop::collection::vec(any::<u8>(), t * b * n * h));
         let numbers = (floats(t * b * n), floats(t * b * n), floats(b), floats(b), floats(b));
         (states, choices, numbers, metrics(b)).prop_map(move |(states, choices, numbers, metrics)| Trajectory {
             shard,
@@ -111,10 +111,7 @@ fn a_wrong_field_is_named_by_its_path() {
         positions: Some(arrays::from_f32(&[2, 1, 1, 3], &[0.0; 6])),
         ..Default::default()
     };
-    assert_eq!(
-        encode(shard, body),
-        "trajectory.positions: shape [2, 1, 1, 3] where [2, 1, 1, 2] is expected"
-    );
+    assert_eq!(encode(shard, body), "trajectory.positions: shape [2, 1, 1, 3] where [2, 1, 1, 2] is expected");
     let huge = v1::Shape { steps: u32::MAX, episodes: u32::MAX, bodies: u32::MAX, dims: u32::MAX, ..shape };
     let body = v1::Trajectory {
         shape: Some(huge),

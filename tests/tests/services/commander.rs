@@ -59,7 +59,8 @@ async fn a_batch_waits_for_its_weights_and_is_told_when_they_do_not_come() {
     let shard = plan(0, 1)[0];
     let request = |version: u32| {
         let weights = weights(version);
-        let key = WeightsKey { run_id: weights.run_id.clone(), version: weights.version, sha256: weights.sha256.clone() };
+        let key =
+            WeightsKey { run_id: weights.run_id.clone(), version: weights.version, sha256: weights.sha256.clone() };
         let shard = magex_core::ids::Shard { version: weights.version, ..shard };
         goal_request(&task(), &shard).to_message(&key)
     };

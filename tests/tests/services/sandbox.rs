@@ -132,8 +132,7 @@ impl Learner {
             seed: SEED,
             lease: options.lease,
         };
-        let limits =
-            Limits { max_actors: options.max_actors, ..Limits::for_task(&options.task, options.max_episodes) };
+        let limits = Limits { max_actors: options.max_actors, ..Limits::for_task(&options.task, options.max_episodes) };
         let (handle, collector) = learner_service(run, limits);
         let (incoming, address) = server::bind(&options.listen).await.unwrap();
         let shutdown = CancellationToken::new();
@@ -211,12 +210,7 @@ pub(crate) fn goal_request(task: &TaskConfig, shard: &Shard) -> GoalRequest {
 }
 
 impl Worker for FakeWorker {
-    fn work(
-        &mut self,
-        shard: &Shard,
-        weights: &Weights,
-        goals: &mut dyn GoalSource,
-    ) -> Result<ShardResult, WorkError> {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
         if let Some(fail) = self.fail {
             fail(shard)?;
         }

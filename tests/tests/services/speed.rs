@@ -3,8 +3,11 @@
 
 use crate::sandbox::*;
 use magex_core::ids::Shard;
+use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::collector::Collector as _;
+use magex_proto::v1;
+use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use std::time::Instant;
 
 #[tokio::test(flavor = "multi_thread")]
@@ -61,4 +64,28 @@ async fn trajectories_of_several_megabytes() {
     );
     actor.stop().await;
     learner.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "measures"]
+async fn assignments_of_fifty_agents() {
+    let commander = Commander::start("127.0.0.1:0", None).await;
+    let channel = magex_runtime::client::endpoint(&commander.url).unwrap().connect().await.unwrap();
+    let mut client = CommanderServiceClient::new(channel);
+    let mut stream = Key::new(1, Purpose::Bench, &[]).stream();
+    let mut points = || {
+        let coordinates = (0..100).map(|_| 10.0 * stream.uniform32()).collect();
+        Some(v1::Positions { dims: 2, coordinates, array: None })
+    };
+    let mut times = Vec::new();
+    for _ in 0..2000 {
+        let scheduler = v1::SchedulerKind::Exact.into();
+        let request = v1::AssignRequest { agents: points(), goals: points(), scheduler, ..Default::default() };
+        let start = Instant::now();
+        client.assign(request).await.unwrap();
+        times.push(start.elapsed().as_secs_f64() * 1e3);
+    }
+    times.sort_by(f64::total_cmp);
+    println!("assign, exact, N = 50: p50 {:.3} ms, p99 {:.3} ms", times[1000], times[1980]);
+    commander.stop().await;
 }

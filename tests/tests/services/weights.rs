@@ -14,8 +14,12 @@ async fn a_slow_reader_skips_to_the_latest() {
     let bytes = Bytes::from(vec![1u8; 3 << 20]);
     let big = |version| Arc::new(Weights::new(RunId("run".into()), WeightsVersion(version), bytes.clone()));
     learner.collector.publish(&big(0)).unwrap();
-    let mut stream =
-        learner_client(&learner.url).await.watch_weights(v1::WatchWeightsRequest::default()).await.unwrap().into_inner();
+    let mut stream = learner_client(&learner.url)
+        .await
+        .watch_weights(v1::WatchWeightsRequest::default())
+        .await
+        .unwrap()
+        .into_inner();
     let mut assembler = WeightsAssembler::default();
     let mut seen = Vec::new();
     for version in 1..=50 {

@@ -93,20 +93,38 @@ impl Op {
     /// Logits plus noise of agent i towards everybody, sixteen neighbours at a time.
     #[inline(always)]
     fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &mut Scratch) {
+        // Several vectors at once hide the latency of the multiply-adds; each lane's sum has the same order either way.
+        let mut v = 0;
+        while v + 4 * LANES <= scratch.padded {
+            self.logits_of::<4>(state, i, v, score, scratch);
+            v += 4 * LANES;
+        }
+        while v < scratch.padded {
+            self.logits_of::<1>(state, i, v, score, scratch);
+            v += LANES;
+        }
+    }
+
+    #[inline(always)]
+    fn logits_of<const Q: usize>(&self, state: usize, i: usize, v: usize, score: &[f32], scratch: &mut Scratch) {
         let (n, p, padded) = (self.block.agents, self.block.pair_hidden, scratch.padded);
         let sender = &scratch.sender[i * p..(i + 1) * p];
-        let bias = f32x16::splat(score[p]);
-        for v in (0..padded).step_by(LANES) {
-            let mut acc = bias;
-            for k in 0..p {
-                let hidden = f32x16::splat(sender[k]) + load(&scratch.receiver[k * padded + v..]);
-                acc = f32x16::splat(score[k]).mul_add(hidden.fast_max(f32x16::ZERO), acc);
+        let mut acc = [f32x16::splat(score[p]); Q];
+        for k in 0..p {
+            let (u, w) = (f32x16::splat(sender[k]), f32x16::splat(score[k]));
+            let receiver = &scratch.receiver[k * padded + v..k * padded + v + Q * LANES];
+            for (q, acc) in acc.iter_mut().enumerate() {
+                let hidden = u + load(&receiver[q * LANES..]);
+                *acc = w.mul_add(hidden.fast_max(f32x16::ZERO), *acc);
             }
+        }
+        for (q, mut acc) in acc.into_iter().enumerate() {
+            let at = v + q * LANES;
             if let GraphNoise::Keyed(keys) = &self.noise {
-                let counter = (self.block.block << 27).wrapping_add((i * n + v) as u32);
+                let counter = (self.block.block << 27).wrapping_add((i * n + at) as u32);
                 acc += logistic(keys[state], counter);
             }
-            store(acc, &mut scratch.logits[v..]);
+            store(acc, &mut scratch.logits[at..]);
         }
     }
 
@@ -236,23 +254,15 @@ impl Op {
                     through_mean = 0.0;
                 }
                 d_sender.fill(f32x16::ZERO);
-                for v in (0..padded).step_by(LANES) {
-                    // d a_ij = g_i · (z_j − mean message), then through σ'((logit + noise) / τ).
-                    let mut d_edge = f32x16::splat(-through_mean);
-                    for k in 0..width {
-                        d_edge = f32x16::splat(g[k]).mul_add(load(&z[k * padded + v..]), d_edge);
-                    }
-                    let soft = sigmoid(load(&scratch.logits[v..]) * inverse_temperature);
-                    let slope = soft * (f32x16::ONE - soft) * inverse_temperature;
-                    let d_logit = (d_edge * slope) & present(i, v, n);
-                    d_score[p] += d_logit;
-                    for k in 0..p {
-                        let hidden = f32x16::splat(scratch.sender[i * p + k]) + load(&scratch.receiver[k * padded + v..]);
-                        let on = hidden.simd_gt(f32x16::ZERO);
-                        d_score[k] = d_logit.mul_add(hidden & on, d_score[k]);
-                        let d_hidden = (d_logit * f32x16::splat(score[k])) & on;
-                        d_sender[k] += d_hidden;
-                        d_receiver[(k * padded + v) / LANES] += d_hidden;
+                let mut v = 0;
+                while v < padded {
+                    let row = Row { i, v, n, through_mean, inverse_temperature };
+                    if v + 4 * LANES <= padded {
+                        self.row_gradient::<4>(row, score, &scratch, &z, &g, &mut d_score, &mut d_sender, &mut d_receiver);
+                        v += 4 * LANES;
+                    } else {
+                        self.row_gradient::<1>(row, score, &scratch, &z, &g, &mut d_score, &mut d_sender, &mut d_receiver);
+                        v += LANES;
                     }
                 }
                 for k in 0..p {
@@ -281,6 +291,67 @@ impl Op {
             *d = sum(v);
         }
         out
+    }
+}
+
+/// Place of a few vectors of neighbours in the gradient of one agent's edges.
+#[derive(Clone, Copy)]
+struct Row {
+    i: usize,
+    v: usize,
+    n: usize,
+    through_mean: f32,
+    inverse_temperature: f32x16,
+}
+
+impl Op {
+    /// Gradient through the edges of agent `row.i` to Q vectors of neighbours.
+    #[allow(clippy::too_many_arguments)] // a kernel: its operands are its meaning
+    #[inline(always)]
+    fn row_gradient<const Q: usize>(
+        &self,
+        row: Row,
+        score: &[f32],
+        scratch: &Scratch,
+        z: &[f32],
+        g: &[f32],
+        d_score: &mut [f32x16],
+        d_sender: &mut [f32x16],
+        d_receiver: &mut [f32x16],
+    ) {
+        let (p, padded) = (self.block.pair_hidden, scratch.padded);
+        // d a_ij = g_i · (z_j − mean message), then through σ'((logit + noise) / τ).
+        let mut d_logit = [f32x16::splat(-row.through_mean); Q];
+        for (k, g) in g.iter().enumerate() {
+            let g = f32x16::splat(*g);
+            let z = &z[k * padded + row.v..k * padded + row.v + Q * LANES];
+            for (q, d) in d_logit.iter_mut().enumerate() {
+                *d = g.mul_add(load(&z[q * LANES..]), *d);
+            }
+        }
+        for (q, d) in d_logit.iter_mut().enumerate() {
+            let at = row.v + q * LANES;
+            let soft = sigmoid(load(&scratch.logits[at..]) * row.inverse_temperature);
+            let slope = soft * (f32x16::ONE - soft) * row.inverse_temperature;
+            *d = (*d * slope) & present(row.i, at, row.n);
+            d_score[p] += *d;
+        }
+        for k in 0..p {
+            let (u, w) = (f32x16::splat(scratch.sender[row.i * p + k]), f32x16::splat(score[k]));
+            let receiver = &scratch.receiver[k * padded + row.v..k * padded + row.v + Q * LANES];
+            let first = (k * padded + row.v) / LANES;
+            let d_receiver = &mut d_receiver[first..first + Q];
+            let (mut d_s, mut d_u) = (d_score[k], d_sender[k]);
+            for q in 0..Q {
+                let hidden = u + load(&receiver[q * LANES..]);
+                d_s = d_logit[q].mul_add(hidden.fast_max(f32x16::ZERO), d_s);
+                let d_hidden = (d_logit[q] * w) & hidden.simd_gt(f32x16::ZERO);
+                d_u += d_hidden;
+                d_receiver[q] += d_hidden;
+            }
+            d_score[k] = d_s;
+            d_sender[k] = d_u;
+        }
     }
 }
 

@@ -1,0 +1,60 @@
+//! The worker of production: rolls out shards with the executor that their weights contain.
+
+use crate::goals::GoalSource;
+use crate::rollout::{Roller, RolloutError};
+use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
+use magex_core::config::RunConfig;
+use magex_core::ids::Shard;
+use magex_core::trajectory::ShardResult;
+use magex_proto::weights::Weights;
+use std::sync::Arc;
+
+/// Rolls out shards. Keeps the executor of the latest weights, so that a version is loaded once.
+#[derive(Debug)]
+pub struct PolicyWorker {
+    config: RunConfig,
+    roller: Option<(String, Roller)>,
+}
+
+impl PolicyWorker {
+    /// A worker for the run that the learner described.
+    ///
+    /// # Errors
+    /// When the configuration cannot be read, or means another task to this build than to the learner's.
+    pub fn new(welcome: &Welcome) -> Result<Self, WorkError> {
+        let config =
+            RunConfig::from_toml(&welcome.run_config_toml).map_err(|error| WorkError::fatal(error.to_string()))?;
+        let own = config.task.fingerprint();
+        if own != welcome.task_fingerprint {
+            return Err(WorkError::fatal(format!(
+                "task_fingerprint: the run's task is {own} to this actor and {} to the learner; use the same release on both \
+                 sides",
+                welcome.task_fingerprint
+            )));
+        }
+        Ok(Self { config, roller: None })
+    }
+
+    /// Makes such workers.
+    pub fn maker() -> MakeWorker {
+        Arc::new(|welcome| Ok(Box::new(Self::new(welcome)?)))
+    }
+
+    fn roller(&mut self, weights: &Weights) -> Result<&Roller, WorkError> {
+        let roller = match self.roller.take() {
+            Some((sha256, roller)) if sha256 == weights.sha256 => roller,
+            _ => Roller::new(&self.config, &weights.bytes)
+                .map_err(|error| WorkError::fatal(format!("weights version {}: {error}", weights.version)))?,
+        };
+        Ok(&self.roller.insert((weights.sha256.clone(), roller)).1)
+    }
+}
+
+impl Worker for PolicyWorker {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
+        self.roller(weights)?.rollout(shard, |request| goals.assign(request)).map_err(|error| match error {
+            RolloutError::Goals(error) => WorkError::Goals(error),
+            other => WorkError::fatal(other.to_string()),
+        })
+    }
+}

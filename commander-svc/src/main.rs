@@ -1,0 +1,22 @@
+//! The commander as a process of its own.
+
+use clap::Parser;
+use magex_commander::cli::{CommanderArgs, run};
+use magex_runtime::exit::{self, Failure};
+use magex_runtime::process::ensure_single_threaded_math;
+use std::process::ExitCode;
+
+/// Hands out goals: to the actors of a MAGE-X run, and to anybody who asks.
+#[derive(Debug, Parser)]
+#[command(name = "magex-commander", version)]
+struct Command {
+    #[command(flatten)]
+    args: CommanderArgs,
+}
+
+fn main() -> ExitCode {
+    if let Err(error) = ensure_single_threaded_math() {
+        return exit::report(Err(Failure::new(exit::INTERNAL, error)));
+    }
+    exit::run(|command: Command| run(command.args))
+}

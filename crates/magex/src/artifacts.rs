@@ -1,0 +1,67 @@
+//! The pictures of a run folder.
+
+use crate::curve::{curve_svg, parse_metrics};
+use crate::replay::{ReplayEpisode, ReplayInfo, replay_html};
+use anyhow::Context as _;
+use magex_core::config::RunConfig;
+use magex_core::trajectory::{EpisodeMetrics, Recording};
+use std::path::{Path, PathBuf};
+
+/// One line that says what a run is.
+pub(crate) fn describe(config: &RunConfig) -> String {
+    let (task, commander) = (&config.task, config.commander.kind);
+    format!(
+        "Simple Spread, N = {}, {} · executor {} · scheduler {commander} · seed {}",
+        task.agents, task.spawn, config.executor.kind, config.run.seed
+    )
+}
+
+/// Draws `curve.svg` from `metrics.jsonl`.
+pub(crate) fn write_curve(folder: &Path, config: &RunConfig) -> anyhow::Result<PathBuf> {
+    let metrics = folder.join("metrics.jsonl");
+    let text = std::fs::read_to_string(&metrics).with_context(|| metrics.display().to_string())?;
+    let svg = curve_svg(&title(folder), &describe(config), &parse_metrics(&text)?)?;
+    write(&folder.join("curve.svg"), svg.as_bytes())
+}
+
+/// Writes a replay page.
+pub(crate) fn write_replay(
+    path: &Path,
+    title: &str,
+    subtitle: &str,
+    config: &RunConfig,
+    episodes: &[(Recording, Option<EpisodeMetrics>)],
+) -> anyhow::Result<PathBuf> {
+    let info = ReplayInfo::simple_spread(title, subtitle, config.task.side);
+    let named: Vec<ReplayEpisode<'_>> = episodes
+        .iter()
+        .enumerate()
+        .map(|(k, (recording, metrics))| ReplayEpisode { name: format!("episode {}", k + 1), recording, metrics: *metrics })
+        .collect();
+    write(path, replay_html(&info, &named)?.as_bytes())
+}
+
+/// Makes `replay.html` from the recordings that the run left.
+pub(crate) fn write_recorded_replay(folder: &Path, config: &RunConfig) -> anyhow::Result<PathBuf> {
+    let source = folder.join("recordings.json");
+    let bytes = std::fs::read(&source).with_context(|| source.display().to_string())?;
+    let recordings: Vec<Recording> = serde_json::from_slice(&bytes).with_context(|| source.display().to_string())?;
+    let episodes: Vec<_> = recordings.into_iter().map(|recording| (recording, None)).collect();
+    let subtitle = format!("{} · greedy evaluation at the end of training", describe(config));
+    write_replay(&folder.join("replay.html"), &title(folder), &subtitle, config, &episodes)
+}
+
+/// Name of the run.
+fn title(folder: &Path) -> String {
+    folder.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
+}
+
+/// Whole files only: written beside and renamed.
+fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<PathBuf> {
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".tmp");
+    std::fs::write(&temporary, bytes)
+        .and_then(|()| std::fs::rename(&temporary, path))
+        .map_err(|error| crate::failure::cannot_create(format!("{}: {error}", path.display())))?;
+    Ok(path.to_owned())
+}

@@ -1,0 +1,9 @@
+//! One file per command.
+
+pub(crate) mod assign;
+pub(crate) mod bench;
+pub(crate) mod eval;
+pub(crate) mod replay;
+pub(crate) mod roles;
+pub(crate) mod train;
+pub(crate) mod verify;

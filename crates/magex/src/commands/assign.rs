@@ -1,0 +1,265 @@
+//! `magex assign`
+
+use crate::cli::Global;
+use crate::failure::{unavailable, usage};
+use crate::output::{Table, note};
+use anyhow::Context as _;
+use magex_core::rng::{Key, Purpose};
+use magex_proto::v1;
+use magex_proto::v1::commander_service_client::CommanderServiceClient;
+use magex_runtime::{client, exit};
+use serde::Deserialize;
+use serde_json::json;
+use std::io::Read as _;
+use std::time::{Duration, Instant};
+use tonic::{Code, Status};
+
+const AFTER_HELP: &str = "\
+Examples:
+  magex assign --connect http://127.0.0.1:7100 --agents '[[0,0],[1,0]]' --goals '[[1,1],[0,1]]'
+  magex assign --connect http://127.0.0.1:7100 --agents team.json --scheduler exact
+  generate-team | magex assign --connect http://127.0.0.1:7100 --agents - --json
+  magex assign --connect http://127.0.0.1:7100 --random 50 --seed 7
+
+A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}; two or three coordinates. With more agents than goals some agents
+get none, and the other way round. gap: how much the summed distance exceeds the least possible.
+
+Exit codes: 0 done, 1 the commander refused or failed, 64 wrong usage or positions, 69 the commander cannot be reached";
+
+/// Ask a running commander who goes where.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub(crate) struct AssignArgs {
+    /// The commander's address.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7100", env = "MAGEX_COMMANDER")]
+    pub(crate) connect: String,
+    /// Positions of the agents: JSON, a file, or - for standard input; a team file brings the goals too.
+    #[arg(long, value_name = "FILE|JSON|-", required_unless_present = "random", conflicts_with = "random")]
+    pub(crate) agents: Option<String>,
+    /// Positions of the goals: JSON or a file.
+    #[arg(long, value_name = "FILE|JSON", conflicts_with = "random")]
+    pub(crate) goals: Option<String>,
+    /// A random team of N agents and N goals instead, uniform in a square of the task's density.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=5000))]
+    pub(crate) random: Option<u32>,
+    /// Who hands out the goals.
+    #[arg(long, value_enum, value_name = "KIND", default_value = "learned")]
+    pub(crate) scheduler: Kind,
+    /// How the goals are chosen.
+    #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
+    pub(crate) mode: Choice,
+    /// Fixes what is random.
+    #[arg(long, value_name = "S")]
+    pub(crate) seed: Option<u64>,
+}
+
+/// What a commander can be asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Kind {
+    /// The trained commander.
+    Learned,
+    /// The least summed distance.
+    Exact,
+    /// The nearest free pair, again and again.
+    Greedy,
+    /// A random matching.
+    Random,
+}
+
+/// How goals are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Choice {
+    /// The most likely ones.
+    Greedy,
+    /// Sampled.
+    Sampled,
+}
+
+/// Agents and goals.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Team {
+    agents: Vec<Vec<f32>>,
+    goals: Vec<Vec<f32>>,
+}
+
+pub(crate) fn run(args: &AssignArgs, global: &Global) -> anyhow::Result<u8> {
+    let team = team(args)?;
+    let request = v1::AssignRequest {
+        agents: Some(positions("agents", &team.agents)?),
+        goals: Some(positions("goals", &team.goals)?),
+        scheduler: scheduler(args.scheduler).into(),
+        mode: match args.mode {
+            Choice::Greedy => v1::Mode::Greedy,
+            Choice::Sampled => v1::Mode::Sampled,
+        }
+        .into(),
+        seed: args.seed,
+        ..Default::default()
+    };
+    let endpoint = client::endpoint(&args.connect).map_err(|error| usage(format!("--connect: {error}")))?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let clock = Instant::now();
+    let response = runtime.block_on(async {
+        let channel = endpoint.connect().await.map_err(|error| {
+            let reason = anyhow::Error::new(error);
+            let reason = reason.root_cause();
+            unavailable(format!("no commander at {}: {reason}; start one with `magex commander`", args.connect))
+        })?;
+        let mut client = CommanderServiceClient::new(channel);
+        let call = client.assign(request);
+        match tokio::time::timeout(Duration::from_secs(30), call).await {
+            Ok(answer) => answer.map(tonic::Response::into_inner).map_err(|status| refused(&args.connect, &status)),
+            Err(_) => Err(unavailable(format!("the commander at {} did not answer within 30 s", args.connect))),
+        }
+    })?;
+    show(args, global, &response, clock.elapsed().as_secs_f64());
+    Ok(exit::OK)
+}
+
+fn refused(url: &str, status: &Status) -> anyhow::Error {
+    match status.code() {
+        Code::InvalidArgument => usage(status.message()),
+        Code::Unavailable | Code::DeadlineExceeded | Code::Unimplemented => {
+            unavailable(format!("{url}: {}", status.message()))
+        }
+        code => anyhow::anyhow!("the commander refused: {code}: {}", status.message()),
+    }
+}
+
+fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round_trip: f64) {
+    let output = global.output();
+    let mut table = Table::new(0, &["agent", "goal", "distance", "probability"]);
+    for pair in &response.pairs {
+        let name = |name: &str, index: u32| if name.is_empty() { index.to_string() } else { name.to_owned() };
+        table.row(vec![
+            name(&pair.agent_id, pair.agent_index),
+            name(&pair.goal_id, pair.goal_index),
+            format!("{:.4}", pair.distance),
+            pair.probability.map_or_else(|| "-".into(), |p| format!("{p:.4}")),
+        ]);
+    }
+    output.say(table.to_string());
+    for (what, left) in [("agents", &response.unassigned_agents), ("goals", &response.unassigned_goals)] {
+        if !left.is_empty() {
+            let list: Vec<String> = left.iter().map(u32::to_string).collect();
+            output.say(format!("  {what} left over: {}", list.join(", ")));
+        }
+    }
+    let answered = kind_name(response.scheduler());
+    let version = match response.sha256.is_empty() {
+        true => String::new(),
+        false => format!(" (version {}, weights {})", response.version, &response.sha256[..12.min(response.sha256.len())]),
+    };
+    output.say(format!(
+        "\n  summed distance {:.4}, least possible {:.4}, gap {:.2} %\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        response.cost,
+        response.exact_cost,
+        100.0 * response.gap,
+        1e3 * response.seconds,
+        1e3 * round_trip
+    ));
+    if !response.fallback_reason.is_empty() {
+        note(format!("note: {answered} answered instead of {:?}: {}", args.scheduler, response.fallback_reason).to_lowercase());
+    }
+    let pairs = response.pairs.iter().map(|p| {
+        json!({ "agent": p.agent_index, "goal": p.goal_index, "distance": p.distance, "probability": p.probability })
+    });
+    output.result(&json!({
+        "pairs": pairs.collect::<Vec<_>>(),
+        "unassigned_agents": response.unassigned_agents,
+        "unassigned_goals": response.unassigned_goals,
+        "cost": response.cost,
+        "exact_cost": response.exact_cost,
+        "gap": response.gap,
+        "scheduler": answered,
+        "version": response.version,
+        "weights_sha256": response.sha256,
+        "run_id": response.run_id,
+        "fallback_reason": response.fallback_reason,
+        "seconds": response.seconds,
+        "round_trip_seconds": round_trip,
+    }));
+}
+
+fn scheduler(kind: Kind) -> v1::SchedulerKind {
+    match kind {
+        Kind::Learned => v1::SchedulerKind::Learned,
+        Kind::Exact => v1::SchedulerKind::Exact,
+        Kind::Greedy => v1::SchedulerKind::Greedy,
+        Kind::Random => v1::SchedulerKind::Random,
+    }
+}
+
+fn kind_name(kind: v1::SchedulerKind) -> &'static str {
+    match kind {
+        v1::SchedulerKind::Learned => "learned",
+        v1::SchedulerKind::Exact => "exact",
+        v1::SchedulerKind::Greedy => "greedy",
+        v1::SchedulerKind::Random => "random",
+        v1::SchedulerKind::Unspecified => "unknown",
+    }
+}
+
+fn team(args: &AssignArgs) -> anyhow::Result<Team> {
+    if let Some(n) = args.random {
+        let side = (2.0 * f64::from(n)).sqrt();
+        let mut stream = Key::new(args.seed.unwrap_or(0), Purpose::Request, &[n]).stream();
+        let mut point = |_| (0..2).map(|_| stream.range(-side / 2.0, side / 2.0) as f32).collect::<Vec<f32>>();
+        return Ok(Team { agents: (0..n).map(&mut point).collect(), goals: (0..n).map(&mut point).collect() });
+    }
+    let agents = read("agents", args.agents.as_deref().unwrap_or_default())?;
+    let Some(goals) = &args.goals else {
+        return serde_json::from_str(&agents).map_err(|error| {
+            usage(format!("--agents: {error}; give {{\"agents\": [[x, y], …], \"goals\": [[x, y], …]}}, or add --goals"))
+        });
+    };
+    let points = |field: &str, text: &str| {
+        serde_json::from_str::<Vec<Vec<f32>>>(text)
+            .map_err(|error| usage(format!("--{field}: {error}; give [[x, y], …]")))
+    };
+    Ok(Team { agents: points("agents", &agents)?, goals: points("goals", &read("goals", goals)?)? })
+}
+
+/// JSON as it is, a file's contents, or standard input.
+fn read(field: &str, text: &str) -> anyhow::Result<String> {
+    match text {
+        "-" => {
+            let mut all = String::new();
+            std::io::stdin().read_to_string(&mut all).context("standard input")?;
+            Ok(all)
+        }
+        _ if text.trim_start().starts_with(['[', '{']) => Ok(text.to_owned()),
+        path => std::fs::read_to_string(path).map_err(|error| usage(format!("--{field} {path}: {error}"))),
+    }
+}
+
+fn positions(field: &str, points: &[Vec<f32>]) -> anyhow::Result<v1::Positions> {
+    let dims = points.first().map_or(0, Vec::len);
+    if !(2..=3).contains(&dims) {
+        return Err(usage(format!("{field}: points of 2 or 3 coordinates are needed, the first has {dims}")));
+    }
+    if let Some(place) = points.iter().position(|point| point.len() != dims) {
+        let wrong = points[place].len();
+        return Err(usage(format!("{field}[{place}]: {wrong} coordinates, the first point has {dims}")));
+    }
+    Ok(v1::Positions { dims: dims as u32, coordinates: points.concat(), array: None })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_must_agree_in_their_dimensions() {
+        assert_eq!(positions("agents", &[vec![1.0, 2.0], vec![3.0, 4.0]]).unwrap().coordinates, [1.0, 2.0, 3.0, 4.0]);
+        for (points, words) in [
+            (vec![], "the first has 0"),
+            (vec![vec![1.0]], "the first has 1"),
+            (vec![vec![1.0, 2.0], vec![1.0]], "agents[1]: 1 coordinates"),
+        ] {
+            let error = positions("agents", &points).unwrap_err().to_string();
+            assert!(error.contains(words), "{error}");
+        }
+    }
+}

@@ -1,0 +1,199 @@
+//! `magex eval`
+
+use crate::cli::Global;
+use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
+use crate::failure::usage;
+use crate::folder;
+use crate::output::{Table, note, share, seconds};
+use crate::settings;
+use crate::artifacts;
+use magex_core::ids::Mode;
+use magex_core::task::Spawn;
+use magex_core::trajectory::EpisodeMetrics;
+use magex_learner::metrics::{EvalSummary, summarise};
+use magex_runtime::exit;
+use serde_json::{Map, Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+
+const AFTER_HELP: &str = "\
+Examples:
+  magex eval runs/simple-spread-50-magex-s1                        100 episodes, greedy and sampled
+  magex eval RUN --seeds 1,2,3 --mode greedy                       300 episodes
+  magex eval RUN --agents 200 --scheduler exact                    a larger team, without training
+  magex eval RUN --controller scripted                             the yardstick
+  magex eval RUN --spawn lines --per-layout                        one row per layout
+  magex eval weights.safetensors --config config.toml --json       weights from elsewhere
+
+success: share of landmarks with an agent within 0.15 at the end. matched: the same, one agent per landmark.
+all covered: share of episodes with every landmark covered. arrival: first step with 99 % covered.
+collisions: other agents in contact, per agent and step. cost: summed distance of the goals over the least possible.
+
+Exit codes: 0 done, 1 evaluation failed, 64 wrong usage or configuration";
+
+/// Measure a run on starts that training never saw.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub(crate) struct EvalArgs {
+    /// Run folder, or a weights file together with --config.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: PathBuf,
+    /// Configuration of a weights file.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Episodes per row.
+    #[arg(long, value_name = "K", default_value_t = 100, value_parser = settings::count)]
+    pub(crate) episodes: u32,
+    /// Seeds of the episodes, one row (per mode) each [default: the run's].
+    #[arg(long, value_name = "S,…", value_delimiter = ',')]
+    pub(crate) seeds: Vec<u64>,
+    /// How actions and goals are chosen [default: both; greedy for the scripted controller].
+    #[arg(long, value_enum, value_name = "MODE")]
+    pub(crate) mode: Option<Modes>,
+    /// One row per layout (spawn modes lines and authors).
+    #[arg(long)]
+    pub(crate) per_layout: bool,
+    /// Evaluation set: names the starts; 3 or more.
+    #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = evaluate::eval_set)]
+    pub(crate) eval_set: u32,
+    /// Rollout threads [default: the cores of this machine].
+    #[arg(long, value_name = "T", value_parser = settings::threads)]
+    pub(crate) threads: Option<usize>,
+    /// Write a replay of the first episode of the first row.
+    #[arg(long, value_name = "FILE.html")]
+    pub(crate) record: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) vary: Variation,
+}
+
+/// One line of the table.
+struct Row {
+    seed: u64,
+    mode: Mode,
+    spawn: Spawn,
+    summary: EvalSummary,
+    wall_s: f64,
+}
+
+pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
+    let output = global.output();
+    let trained = folder::load(&args.run, args.config.as_deref())?;
+    trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
+    let config = args.vary.apply(&trained)?;
+    let scheduler = args.vary.scheduler_of(&config);
+    let modes = args.mode.unwrap_or(match args.vary.controller {
+        Controller::Learned => Modes::Both,
+        Controller::Scripted => Modes::Greedy,
+    });
+    let seeds = if args.seeds.is_empty() { vec![config.run.seed] } else { args.seeds.clone() };
+    let spawns = layouts(config.task.spawn, args.per_layout)?;
+    let threads = args.threads.unwrap_or_else(settings::cores);
+    let driver = match args.vary.controller {
+        Controller::Learned => format!("executor {}", config.executor.kind),
+        Controller::Scripted => "scripted controller".to_owned(),
+    };
+    note(format!(
+        "{} · weights {} · N = {} · {driver} · scheduler {scheduler} · {} episodes per row",
+        trained.name,
+        &trained.sha256[..12.min(trained.sha256.len())],
+        config.task.agents,
+        args.episodes
+    ));
+
+    let mut rows: Vec<Row> = Vec::new();
+    let mut all: Vec<(Mode, Vec<EpisodeMetrics>)> = Vec::new();
+    for &spawn in &spawns {
+        for &seed in &seeds {
+            let mut config = config.clone();
+            (config.run.seed, config.task.spawn) = (seed, spawn);
+            let crew = args.vary.crew(&config, &trained.weights)?;
+            for &mode in modes.list() {
+                let clock = Instant::now();
+                let record = u32::from(args.record.is_some() && rows.is_empty());
+                let episodes = Episodes { count: args.episodes, set: args.eval_set, mode, record };
+                let (metrics, recordings) = roll_out(&crew, &config, episodes, threads)?;
+                if let (Some(path), Some(recording)) = (&args.record, recordings.into_iter().next()) {
+                    let subtitle = format!("{} · {} evaluation", artifacts::describe(&config), mode_name(mode));
+                    let episode = [(recording, metrics.first().copied())];
+                    artifacts::write_replay(path, &trained.name, &subtitle, &config, &episode)?;
+                    note(format!("replay: {}", path.display()));
+                }
+                if let Some(summary) = summarise(&metrics) {
+                    rows.push(Row { seed, mode, spawn, summary, wall_s: clock.elapsed().as_secs_f64() });
+                }
+                all.push((mode, metrics));
+            }
+        }
+    }
+
+    let mut means = Map::new();
+    let mut table = Table::new(3, &HEADING);
+    for row in &rows {
+        table.row(cells(row.spawn.to_string(), row.seed.to_string(), row.mode, &row.summary));
+    }
+    for &mode in modes.list() {
+        let of_mode = all.iter().filter(|(m, _)| *m == mode).flat_map(|(_, metrics)| metrics);
+        let Some(summary) = summarise(of_mode) else { continue };
+        if rows.len() > modes.list().len() {
+            table.row(cells("all".into(), String::new(), mode, &summary));
+        }
+        means.insert(mode_name(mode).into(), serde_json::to_value(&summary)?);
+    }
+    output.say(table.to_string());
+    note(format!("{} with {threads} threads", seconds(rows.iter().map(|row| row.wall_s).sum())));
+    output.result(&json!({
+        "run": args.run,
+        "weights_sha256": trained.sha256,
+        "agents": config.task.agents,
+        "horizon": config.task.horizon,
+        "executor": config.executor.kind,
+        "scheduler": scheduler,
+        "controller": format!("{:?}", args.vary.controller).to_lowercase(),
+        "eval_set": args.eval_set,
+        "rows": rows.iter().map(value).collect::<Result<Vec<_>, _>>()?,
+        "mean": means,
+    }));
+    Ok(exit::OK)
+}
+
+/// The spawn modes of the rows.
+fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
+    match spawn {
+        _ if !each => Ok(vec![spawn]),
+        Spawn::Lines(_) => Ok((0..4).map(|k| Spawn::Lines(Some(k))).collect()),
+        Spawn::Authors(_) => Ok((0..4).map(|k| Spawn::Authors(Some(k))).collect()),
+        Spawn::Uniform => Err(usage("--per-layout: the uniform spawn has no layouts; add --spawn lines or authors")),
+    }
+}
+
+const HEADING: [&str; 11] = [
+    "spawn", "seed", "mode", "episodes", "success", "matched", "all covered", "arrival", "collisions", "cost", "reward",
+];
+
+fn cells(spawn: String, seed: String, mode: Mode, summary: &EvalSummary) -> Vec<String> {
+    let s = summary;
+    vec![
+        spawn,
+        seed,
+        mode_name(mode).into(),
+        s.episodes.to_string(),
+        share(s.success_rate),
+        share(s.matched_success_rate),
+        share(s.all_covered_rate),
+        format!("{:.1}", s.arrival_step),
+        format!("{:.4}", s.collisions_per_agent_step),
+        format!("{:.4}", s.cost_ratio),
+        format!("{:.3}", s.reward),
+    ]
+}
+
+fn value(row: &Row) -> serde_json::Result<Value> {
+    let mut value = serde_json::to_value(&row.summary)?;
+    if let Value::Object(map) = &mut value {
+        map.insert("seed".into(), json!(row.seed));
+        map.insert("mode".into(), json!(mode_name(row.mode)));
+        map.insert("spawn".into(), json!(row.spawn));
+        map.insert("wall_s".into(), json!(row.wall_s));
+    }
+    Ok(value)
+}

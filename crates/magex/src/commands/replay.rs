@@ -1,0 +1,75 @@
+//! `magex replay`
+
+use crate::artifacts::{describe, write_replay};
+use crate::cli::Global;
+use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
+use crate::folder;
+use crate::settings;
+use magex_core::ids::Mode;
+use magex_runtime::exit;
+use serde_json::json;
+use std::path::PathBuf;
+
+const AFTER_HELP: &str = "\
+Examples:
+  magex replay runs/simple-spread-50-magex-s1                      refreshes replay.html in the run folder
+  magex replay RUN --episodes 8 --spawn uniform --out wild.html    eight episodes from other starts
+  magex replay RUN --agents 200 --scheduler exact --out big.html   a larger team
+  magex replay RUN --controller scripted --out yardstick.html
+
+The page has everything inside: open it with a double click, or send it to somebody.
+
+Exit codes: 0 done, 1 rollout failed, 64 wrong usage or configuration, 73 the file cannot be written";
+
+/// Record evaluation episodes as a page to look at.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub(crate) struct ReplayArgs {
+    /// Run folder, or a weights file together with --config.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: PathBuf,
+    /// Configuration of a weights file.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// The page [default: replay.html in the run folder].
+    #[arg(long, short, value_name = "FILE.html")]
+    pub(crate) out: Option<PathBuf>,
+    /// Episodes on the page.
+    #[arg(long, value_name = "K", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(crate) episodes: u32,
+    /// How actions and goals are chosen.
+    #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
+    pub(crate) mode: Modes,
+    /// Evaluation set: names the starts; 3 or more.
+    #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = evaluate::eval_set)]
+    pub(crate) eval_set: u32,
+    #[command(flatten)]
+    pub(crate) vary: Variation,
+}
+
+pub(crate) fn run(args: &ReplayArgs, global: &Global) -> anyhow::Result<u8> {
+    let output = global.output();
+    let trained = folder::load(&args.run, args.config.as_deref())?;
+    trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
+    let config = args.vary.apply(&trained)?;
+    let crew = args.vary.crew(&config, &trained.weights)?;
+    let mut episodes = Vec::new();
+    for &mode in args.mode.list() {
+        let wanted = Episodes { count: args.episodes, set: args.eval_set, mode, record: args.episodes };
+        let (metrics, recordings) = roll_out(&crew, &config, wanted, settings::cores())?;
+        episodes.extend(recordings.into_iter().zip(metrics.into_iter().map(Some)));
+    }
+    let modes: Vec<&str> = args.mode.list().iter().map(|&mode: &Mode| mode_name(mode)).collect();
+    let driver = match args.vary.controller {
+        Controller::Learned => String::new(),
+        Controller::Scripted => " · scripted controller".to_owned(),
+    };
+    let scheduler = args.vary.scheduler.map(|kind| format!(" · goals from {kind}")).unwrap_or_default();
+    let subtitle = format!("{} · {}{driver}{scheduler}", describe(&config), modes.join(" and "));
+    let folder = trained.folder.clone().unwrap_or_default();
+    let path = args.out.clone().unwrap_or_else(|| folder.join("replay.html"));
+    write_replay(&path, &trained.name, &subtitle, &config, &episodes)?;
+    output.say(format!("{} ({} episodes): open it in a browser", path.display(), episodes.len()));
+    output.result(&json!({ "out": path, "episodes": episodes.len(), "weights_sha256": trained.sha256 }));
+    Ok(exit::OK)
+}

@@ -1,0 +1,115 @@
+//! `magex learner`, `magex actor`, `magex commander`: the services from the one executable, each on its own.
+
+use magex_actor::cli::ActorArgs;
+use magex_commander::cli::CommanderArgs;
+use magex_learner::cli::LearnerArgs;
+use magex_runtime::exit::{self, Failure};
+use std::io::Read as _;
+use std::time::Duration;
+
+const LEARNER_HELP: &str = "\
+Examples:
+  magex learner --config run.toml --out runs/mine --listen 0.0.0.0:7000
+  magex learner --out runs/mine --resume
+
+Options can be set in the environment too; options of the command win. Actors and commander may start before or after it.
+
+Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or configuration, 69 the port is in use,
+73 --out exists or cannot be written, 75 stopped before the end (--resume continues), 130 interrupted twice";
+
+const ACTOR_HELP: &str = "\
+Examples:
+  magex actor --learner http://10.0.0.1:7000 --commander http://10.0.0.2:7100
+  magex actor --threads 4 --stay
+
+An actor that finds no learner waits for one. How many actors there are does not change a number of the run.
+
+Exit codes: 0 the run is complete or the actor was told to stop, 64 wrong usage, 69 the learner refused, 130 interrupted twice";
+
+const COMMANDER_HELP: &str = "\
+Examples:
+  magex commander --learner http://127.0.0.1:7000                               follows a run
+  magex commander --weights RUN/weights.safetensors --config RUN/config.toml    serves a finished run
+  magex commander                                                               exact, greedy and random only
+
+Ask it with magex assign, or over gRPC (reflection is on).
+
+Exit codes: 0 told to stop, 64 wrong usage or weights, 69 the port is in use, 70 a fault of this program, 130 interrupted twice";
+
+/// Run the learner alone: leases work to actors, trains, broadcasts weights.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = LEARNER_HELP)]
+pub(crate) struct LearnerRole {
+    #[command(flatten)]
+    args: LearnerArgs,
+    #[command(flatten)]
+    leash: Leash,
+}
+
+/// Run an actor alone: rolls out episodes for a learner.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = ACTOR_HELP)]
+pub(crate) struct ActorRole {
+    #[command(flatten)]
+    args: ActorArgs,
+    #[command(flatten)]
+    leash: Leash,
+}
+
+/// Run the goal commander alone: answers who goes where.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = COMMANDER_HELP)]
+pub(crate) struct CommanderRole {
+    #[command(flatten)]
+    args: CommanderArgs,
+    #[command(flatten)]
+    leash: Leash,
+}
+
+/// How a service that was started by another process learns that this process is gone.
+#[derive(Debug, Clone, Copy, clap::Args)]
+struct Leash {
+    /// Stop when standard input ends.
+    #[arg(long = LEASH, hide = true)]
+    leash: bool,
+}
+
+/// Name of the option that ties a service to whoever holds the other end of its standard input.
+pub(crate) const LEASH: &str = "stop-with-stdin";
+
+/// A service that was told to stop is gone after this time.
+const GRACE: Duration = Duration::from_secs(8);
+
+pub(crate) fn learner(role: &LearnerRole) -> anyhow::Result<u8> {
+    role.leash.tie()?;
+    Ok(magex_learner::cli::run(role.args.clone())?)
+}
+
+pub(crate) fn actor(role: &ActorRole) -> anyhow::Result<u8> {
+    role.leash.tie()?;
+    Ok(magex_actor::cli::run(role.args.clone())?)
+}
+
+pub(crate) fn commander(role: &CommanderRole) -> anyhow::Result<u8> {
+    role.leash.tie()?;
+    Ok(magex_commander::cli::run(role.args.clone())?)
+}
+
+impl Leash {
+    fn tie(self) -> Result<(), Failure> {
+        if !self.leash {
+            return Ok(());
+        }
+        let watch = || {
+            let mut ignored = [0u8; 64];
+            // Ends with the pipe, however the process at its other end went.
+            while matches!(std::io::stdin().read(&mut ignored), Ok(1..)) {}
+            // The same way out as for a person's SIGTERM.
+            let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::TERM);
+            std::thread::sleep(GRACE);
+            std::process::exit(i32::from(exit::TEMPORARY));
+        };
+        let thread = std::thread::Builder::new().name("magex-leash".into()).spawn(watch);
+        thread.map(drop).map_err(|error| Failure::new(exit::INTERNAL, error))
+    }
+}

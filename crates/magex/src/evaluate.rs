@@ -1,0 +1,237 @@
+//! Evaluation in this process: shards of whole episodes on spawns that training never saw.
+
+use crate::failure::usage;
+use crate::folder::Trained;
+use crate::local::{Crew, commander};
+use crate::settings::resize;
+use magex_actor::rollout::Roller;
+use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+use magex_core::task::Spawn;
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
+use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
+
+/// Evaluation set of `magex eval` unless another is named.
+pub(crate) const EVAL_SET: u32 = 100;
+/// Agents that one shard has at most, unless one episode has more: bounds the memory of a rollout.
+const AGENTS_PER_SHARD: usize = 800;
+/// Episodes that one shard has at most.
+const EPISODES_PER_SHARD: u32 = 16;
+
+/// Who drives the agents.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub(crate) enum Controller {
+    /// The trained executor.
+    #[default]
+    Learned,
+    /// The scripted controller: thrust towards the goal, no learning; a yardstick.
+    Scripted,
+}
+
+/// How actions and goals are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Modes {
+    /// The most likely action, goal and edges.
+    Greedy,
+    /// Sampled from the policy.
+    Sampled,
+    /// One row each.
+    Both,
+}
+
+impl Modes {
+    /// The modes, greedy first.
+    pub(crate) fn list(self) -> &'static [Mode] {
+        match self {
+            Self::Greedy => &[Mode::Greedy],
+            Self::Sampled => &[Mode::Sampled],
+            Self::Both => &[Mode::Greedy, Mode::Sampled],
+        }
+    }
+}
+
+/// The name of a mode.
+pub(crate) fn mode_name(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Greedy => "greedy",
+        Mode::Sampled => "sampled",
+    }
+}
+
+/// What an evaluation changes about the run.
+#[derive(Debug, Clone, Default, PartialEq, clap::Args)]
+#[command(next_help_heading = "What is evaluated (the run's own unless given)")]
+pub(crate) struct Variation {
+    /// Starts: uniform, lines, lines-0..3, authors or authors-0..3.
+    #[arg(long, value_name = "MODE")]
+    pub(crate) spawn: Option<Spawn>,
+    /// Team size, at the same density (not for the mlp executor and the ranking scheduler, which are built for one size).
+    #[arg(long, value_name = "N")]
+    pub(crate) agents: Option<usize>,
+    /// Who hands out goals: pairwise, ranking, exact or random.
+    #[arg(long, value_name = "KIND")]
+    pub(crate) scheduler: Option<CommanderKind>,
+    /// Who drives the agents.
+    #[arg(long, value_enum, value_name = "WHO", default_value_t)]
+    pub(crate) controller: Controller,
+    /// Joint steps per episode.
+    #[arg(long, value_name = "T")]
+    pub(crate) horizon: Option<u32>,
+}
+
+impl Variation {
+    /// The run's configuration as it is evaluated.
+    pub(crate) fn apply(&self, trained: &Trained) -> anyhow::Result<RunConfig> {
+        let mut config = trained.config.clone();
+        if let Some(agents) = self.agents.filter(|&agents| agents != config.task.agents) {
+            let own = config.task.agents;
+            let fixed = match (config.executor.kind, self.scheduler.unwrap_or(config.commander.kind)) {
+                (ExecutorKind::Mlp, _) if self.controller == Controller::Learned => Some(("the mlp executor", "")),
+                (_, CommanderKind::Ranking) => Some(("the ranking scheduler", "; use --scheduler exact")),
+                _ => None,
+            };
+            if let Some((who, remedy)) = fixed {
+                return Err(usage(format!("--agents {agents}: {who} of this run was built for {own} agents{remedy}")));
+            }
+            resize(&mut config.task, agents);
+        }
+        if let Some(kind) = self.scheduler.filter(|kind| kind.learned() && *kind != config.commander.kind) {
+            let own = config.commander.kind;
+            return Err(usage(format!(
+                "--scheduler {kind}: the run trained the {own} scheduler; use {own}, exact or random"
+            )));
+        }
+        config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
+        config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
+        // Nothing is learned here; the chunk need not fit the horizon.
+        config.mappo.chunk = 1;
+        Ok(config.resolved()?)
+    }
+
+    /// Who rolls out.
+    pub(crate) fn crew(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<Crew> {
+        let roller = match self.controller {
+            Controller::Learned => Roller::new(config, weights)?,
+            Controller::Scripted => Roller::scripted(config)?,
+        };
+        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)? })
+    }
+
+    /// The scheduler that hands out goals.
+    pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderKind {
+        self.scheduler.unwrap_or(config.commander.kind)
+    }
+}
+
+/// Which episodes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Episodes {
+    /// How many.
+    pub(crate) count: u32,
+    /// Evaluation set.
+    pub(crate) set: u32,
+    /// How actions and goals are chosen.
+    pub(crate) mode: Mode,
+    /// Record the first so many.
+    pub(crate) record: u32,
+}
+
+/// The evaluation sets of training are not for reporting.
+pub(crate) fn eval_set(text: &str) -> Result<u32, String> {
+    let first = EVAL_SET_TRAINING.max(EVAL_SET_FINAL) + 1;
+    match text.parse() {
+        Ok(set) if set >= first => Ok(set),
+        _ => Err(format!("sets below {first} belong to training; use {first} or more")),
+    }
+}
+
+/// Rolls the episodes out: their metrics in order, and the recordings of the first ones.
+pub(crate) fn roll_out(
+    crew: &Crew,
+    config: &RunConfig,
+    episodes: Episodes,
+    threads: usize,
+) -> anyhow::Result<(Vec<EpisodeMetrics>, Vec<Recording>)> {
+    let plan = plan(episodes, config.task.agents);
+    let (mut metrics, mut recordings) = (Vec::new(), Vec::new());
+    for result in crew.work_all(&plan, threads)? {
+        if let ShardResult::Eval(EvalOutcome { metrics: more, recording, .. }) = result {
+            metrics.extend(more);
+            recordings.extend(recording);
+        }
+    }
+    Ok((metrics, recordings))
+}
+
+/// Recorded episodes are shards of their own: a shard records its first episode. The cut does not change a result.
+fn plan(episodes: Episodes, agents: usize) -> Vec<Shard> {
+    let most = (AGENTS_PER_SHARD / agents.max(1)).clamp(1, EPISODES_PER_SHARD as usize) as u32;
+    let mut shards = Vec::new();
+    let mut first = 0;
+    while first < episodes.count {
+        let record = first < episodes.record;
+        let count = if record { 1 } else { most.min(episodes.count - first) };
+        shards.push(Shard {
+            kind: ShardKind::Eval,
+            iteration: Iteration(0),
+            index: shards.len() as u32,
+            episodes: count,
+            first_episode: first,
+            version: WeightsVersion(0),
+            mode: episodes.mode,
+            eval_set: episodes.set,
+            record,
+        });
+        first += count;
+    }
+    shards
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_episode_is_in_one_shard_and_memory_is_bounded() {
+        for (count, agents, record) in [(100, 5, 0), (100, 50, 1), (7, 1000, 0), (33, 200, 3), (1, 50, 1)] {
+            let shards = plan(Episodes { count, set: EVAL_SET, mode: Mode::Greedy, record }, agents);
+            let mut next = 0;
+            for shard in &shards {
+                assert_eq!(shard.first_episode, next);
+                assert!(shard.episodes == 1 || shard.episodes as usize * agents <= AGENTS_PER_SHARD);
+                next += shard.episodes;
+            }
+            assert_eq!(next, count);
+            assert_eq!(shards.iter().filter(|s| s.record).count() as u32, record);
+        }
+    }
+
+    #[test]
+    fn training_sets_are_refused() {
+        for set in ["0", "1", "2", "x"] {
+            assert!(eval_set(set).unwrap_err().contains("3 or more"));
+        }
+        assert_eq!(eval_set("100"), Ok(EVAL_SET));
+    }
+
+    fn trained(toml: &str) -> Trained {
+        let config = RunConfig::from_toml(toml).unwrap();
+        let (weights, sha256, name) = (Vec::new(), String::new(), String::new());
+        Trained { config, weights, sha256, name, folder: None, notes: Vec::new() }
+    }
+
+    #[test]
+    fn another_size_is_the_same_density_and_fixed_sizes_are_refused() {
+        let vary = Variation { agents: Some(200), horizon: Some(77), ..Variation::default() };
+        let config = vary.apply(&trained("")).unwrap();
+        assert_eq!((config.task.agents, config.task.side, config.task.horizon), (200, 20.0, 77));
+        let error = vary.apply(&trained("[executor]\nkind = 'mlp'")).unwrap_err().to_string();
+        assert!(error.contains("mlp") && error.contains("50"), "{error}");
+        let error = vary.apply(&trained("[commander]\nkind = 'ranking'")).unwrap_err().to_string();
+        assert!(error.contains("--scheduler exact"), "{error}");
+        let exact = Variation { scheduler: Some(CommanderKind::Exact), ..vary.clone() };
+        exact.apply(&trained("[commander]\nkind = 'ranking'")).unwrap();
+        let ranking = Variation { scheduler: Some(CommanderKind::Ranking), ..Variation::default() };
+        assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact or random"));
+    }
+}

@@ -1,0 +1,194 @@
+//! Run folders: where they are, what is in them, and when one may be written to.
+//!
+//! | file | what it is |
+//! |---|---|
+//! | `config.toml` | the effective configuration, every key |
+//! | `metrics.jsonl` | one line per iteration |
+//! | `checkpoints/` | the latest checkpoints, weights as safetensors |
+//! | `weights.safetensors`, `summary.json`, `recordings.json` | the end of the run |
+//! | `curve.svg`, `replay.html` | pictures |
+//! | `logs/` | what the services of the run wrote |
+
+use crate::failure::{cannot_create, usage};
+use anyhow::Context as _;
+use magex_core::config::RunConfig;
+use magex_core::task::TaskName;
+use magex_learner::checkpoint::{self, CheckpointError, Learned, sha256_hex};
+use magex_learner::commander::CommanderPpo;
+use magex_learner::mappo::Mappo;
+use std::path::{Path, PathBuf};
+
+/// The effective configuration.
+pub(crate) const CONFIG: &str = "config.toml";
+/// The result of a finished run.
+pub(crate) const SUMMARY: &str = "summary.json";
+/// The trained networks.
+pub(crate) const WEIGHTS: &str = "weights.safetensors";
+
+/// `runs/<task>-<N>-<executor>-s<seed>`, or the same with -2, -3, … if there is such a folder.
+pub(crate) fn default_out(config: &RunConfig, exists: impl Fn(&Path) -> bool) -> PathBuf {
+    let task = match config.task.name {
+        TaskName::SimpleSpread => "simple-spread",
+    };
+    let name = format!("{task}-{}-{}-s{}", config.task.agents, config.executor.kind, config.run.seed);
+    let first = Path::new("runs").join(&name);
+    if !exists(&first) {
+        return first;
+    }
+    (2u32..).map(|k| Path::new("runs").join(format!("{name}-{k}"))).find(|path| !exists(path)).unwrap_or(first)
+}
+
+/// Makes the folder of a new run with its configuration. A folder with something in it is refused.
+pub(crate) fn create(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
+    let failed = |error: std::io::Error| cannot_create(format!("--out {}: {error}", folder.display()));
+    if folder.exists() {
+        let empty = folder.is_dir() && std::fs::read_dir(folder).map_err(failed)?.next().is_none();
+        if !empty {
+            let remedy = if folder.join(CONFIG).is_file() {
+                "add --resume to continue the run in it, or choose another folder"
+            } else {
+                "choose another folder"
+            };
+            return Err(cannot_create(format!("--out {} exists; {remedy}", folder.display())));
+        }
+    }
+    std::fs::create_dir_all(folder).map_err(failed)?;
+    std::fs::write(folder.join(CONFIG), config.to_toml()?).map_err(failed)
+}
+
+/// The configuration of an existing run.
+pub(crate) fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
+    let path = folder.join(CONFIG);
+    let text = std::fs::read_to_string(&path).map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => {
+            usage(format!("{} is not a run folder: there is no {CONFIG} in it", folder.display()))
+        }
+        _ => usage(format!("{}: {error}", path.display())),
+    })?;
+    RunConfig::from_toml(&text).with_context(|| path.display().to_string())
+}
+
+/// A trained run, or its beginnings.
+#[derive(Debug)]
+pub(crate) struct Trained {
+    /// What it was trained with.
+    pub(crate) config: RunConfig,
+    /// Weights file.
+    pub(crate) weights: Vec<u8>,
+    /// SHA-256 of the weights file.
+    pub(crate) sha256: String,
+    /// Name for people.
+    pub(crate) name: String,
+    /// The folder, unless a weights file was named.
+    pub(crate) folder: Option<PathBuf>,
+    /// What a person should know about the weights.
+    pub(crate) notes: Vec<String>,
+}
+
+/// Loads a run folder, or a weights file together with a configuration file.
+pub(crate) fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
+    if path.is_file() {
+        let Some(config) = config else {
+            return Err(usage(format!("{} is a file: add --config with the run's config.toml", path.display())));
+        };
+        let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
+        let config = crate::settings::read(Some(config))?;
+        let (sha256, name) = (sha256_hex(&weights), path.display().to_string());
+        return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new() });
+    }
+    if !path.is_dir() {
+        return Err(usage(format!("RUN: {} does not exist", path.display())));
+    }
+    if config.is_some() {
+        return Err(usage("--config: a run folder has its own configuration; leave it out"));
+    }
+    let config = config_of(path)?;
+    let (weights, notes) = weights_of(path, &config)?;
+    let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
+    Ok(Trained { config, sha256: sha256_hex(&weights), weights, name, folder: Some(path.to_owned()), notes })
+}
+
+/// The final weights if they are there and whole, else those of the newest usable checkpoint.
+fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec<String>)> {
+    let mut notes = Vec::new();
+    let expected = std::fs::read(folder.join(SUMMARY))
+        .ok()
+        .and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok())
+        .and_then(|summary| summary["weights_sha256"].as_str().map(str::to_owned));
+    match (std::fs::read(folder.join(WEIGHTS)), expected) {
+        (Ok(bytes), Some(expected)) if sha256_hex(&bytes) == expected => return Ok((bytes, notes)),
+        (Ok(_), Some(_)) => notes.push(format!("{WEIGHTS} is corrupt (its checksum differs from {SUMMARY})")),
+        (Err(_), Some(_)) => notes.push(format!("{WEIGHTS} is missing")),
+        (_, None) => notes.push("the run is not finished".to_owned()),
+    }
+    let template = Learned {
+        executor: Mappo::new(config)?.start()?,
+        commander: CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed).start()?,
+    };
+    let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
+    notes.extend(skipped.iter().map(what_is_wrong));
+    notes.push(format!("using checkpoint {:06}", progress.iteration));
+    Ok((learned.weights()?, notes))
+}
+
+/// `checkpoint 000010 is corrupt (weights.safetensors: its checksum differs from the manifest)`
+pub(crate) fn what_is_wrong(error: &CheckpointError) -> String {
+    let (path, reason) = match error {
+        CheckpointError::Corrupt { path, reason } => (path, reason.clone()),
+        CheckpointError::Io { path, error } => (path, error.to_string()),
+        other => return format!("a checkpoint is corrupt ({other})"),
+    };
+    let text = |part: Option<&std::ffi::OsStr>| part.map(|p| p.to_string_lossy().into_owned()).unwrap_or_default();
+    let checkpoint = text(path.parent().and_then(Path::file_name));
+    format!("checkpoint {checkpoint} is corrupt ({}: {reason})", text(path.file_name()))
+}
+
+/// The checkpoint that a resumed run continues from when the newest `skipped` ones cannot be used.
+pub(crate) fn continues_from(folder: &Path, skipped: usize) -> Option<String> {
+    let folders = checkpoint::list(folder).ok()?;
+    folders.iter().rev().nth(skipped)?.file_name().map(|name| name.to_string_lossy().into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_default_name_says_what_the_run_is_and_never_collides() {
+        let config = RunConfig::default();
+        assert_eq!(default_out(&config, |_| false), Path::new("runs/simple-spread-50-magex-s1"));
+        let taken = ["runs/simple-spread-50-magex-s1", "runs/simple-spread-50-magex-s1-2"];
+        let out = default_out(&config, |path| taken.iter().any(|t| path == Path::new(t)));
+        assert_eq!(out, Path::new("runs/simple-spread-50-magex-s1-3"));
+    }
+
+    #[test]
+    fn a_folder_with_something_in_it_is_refused_with_a_remedy() {
+        let dir = std::env::temp_dir().join(format!("magex-folder-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&dir);
+        let config = RunConfig::default();
+        std::fs::create_dir_all(&dir).unwrap();
+        create(&dir, &config).unwrap();
+        assert_eq!(config_of(&dir).unwrap(), config);
+        let error = create(&dir, &config).unwrap_err();
+        assert!(error.to_string().contains("--resume"), "{error}");
+        assert_eq!(crate::failure::code_of(&error), magex_runtime::exit::CANNOT_CREATE);
+        std::fs::remove_file(dir.join(CONFIG)).unwrap();
+        std::fs::write(dir.join("thesis.tex"), "").unwrap();
+        assert!(!create(&dir, &config).unwrap_err().to_string().contains("--resume"));
+        assert!(config_of(&dir).unwrap_err().to_string().contains("not a run folder"));
+        std::fs::remove_dir_all(&dir).unwrap();
+    }
+
+    #[test]
+    fn corrupt_checkpoints_are_named() {
+        let error = CheckpointError::Corrupt {
+            path: "runs/x/checkpoints/000010/state.json".into(),
+            reason: "its checksum differs from the manifest".into(),
+        };
+        assert_eq!(
+            what_is_wrong(&error),
+            "checkpoint 000010 is corrupt (state.json: its checksum differs from the manifest)"
+        );
+    }
+}

@@ -1,0 +1,151 @@
+//! What a command says on standard output: text and tables for people, or one JSON object on the last line.
+
+use serde_json::Value;
+use std::io::{IsTerminal as _, Write as _};
+
+/// Where results go. With `--json` standard output carries the JSON object alone, and what people read goes to standard error.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Output {
+    json: bool,
+}
+
+impl Output {
+    /// For people, or for machines.
+    pub(crate) fn new(json: bool) -> Self {
+        Self { json }
+    }
+
+    /// Text for people.
+    pub(crate) fn say(&self, text: impl AsRef<str>) {
+        let text = text.as_ref();
+        // Whoever closed the pipe does not want to know.
+        let _ = match self.json {
+            true => writeln!(std::io::stderr().lock(), "{text}"),
+            false => writeln!(std::io::stdout().lock(), "{text}"),
+        };
+    }
+
+    /// The machine-readable result.
+    pub(crate) fn result(&self, value: &Value) {
+        if self.json {
+            let mut stdout = std::io::stdout().lock();
+            let _ = writeln!(stdout, "{value}").and_then(|()| stdout.flush());
+        }
+    }
+}
+
+/// A line on standard error.
+pub(crate) fn note(text: impl AsRef<str>) {
+    crate::logging::around_live_line(|| {
+        let _ = writeln!(std::io::stderr().lock(), "{}", text.as_ref());
+    });
+}
+
+/// Whether standard error shows colours.
+pub(crate) fn colours() -> bool {
+    std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none()
+}
+
+/// A table with a heading; the first `left` columns are aligned left, numbers to the right.
+#[derive(Debug, Clone)]
+pub(crate) struct Table {
+    left: usize,
+    rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// With the names of the columns.
+    pub(crate) fn new(left: usize, heading: &[&str]) -> Self {
+        Self { left, rows: vec![heading.iter().map(|&cell| cell.to_owned()).collect()] }
+    }
+
+    /// Adds a row.
+    pub(crate) fn row(&mut self, cells: Vec<String>) {
+        self.rows.push(cells);
+    }
+}
+
+impl std::fmt::Display for Table {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
+        let width = |c: usize| self.rows.iter().filter_map(|r| r.get(c)).map(|x| x.chars().count()).max().unwrap_or(0);
+        let widths: Vec<usize> = (0..columns).map(width).collect();
+        for (index, row) in self.rows.iter().enumerate() {
+            let mut line = String::new();
+            for (column, cell) in row.iter().enumerate() {
+                let width = widths[column];
+                let gap = if column == 0 { "  " } else { "   " };
+                line += gap;
+                line += &if column < self.left { format!("{cell:<width$}") } else { format!("{cell:>width$}") };
+            }
+            f.write_str(line.trim_end())?;
+            if index + 1 < self.rows.len() {
+                f.write_str("\n")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// 12345.6 → `12,346`.
+pub(crate) fn thousands(value: f64) -> String {
+    let digits = format!("{:.0}", value.abs());
+    let mut out = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(digit);
+    }
+    if value < 0.0 && digits != "0" { format!("-{out}") } else { out }
+}
+
+/// A share between 0 and 1: four decimals, and never rounded up to 1.
+pub(crate) fn share(value: f64) -> String {
+    if value < 1.0 { format!("{:.4}", value.min(0.9999)) } else { format!("{value:.4}") }
+}
+
+/// A span of time.
+pub(crate) fn seconds(value: f64) -> String {
+    if value < 100.0 {
+        format!("{value:.1} s")
+    } else {
+        format!("{:.0} min {:02.0} s", (value / 60.0).floor(), (value % 60.0).floor())
+    }
+}
+
+/// How this command is called, for the lines that say what to run next.
+pub(crate) fn program() -> String {
+    if std::env::var_os("CARGO_MANIFEST_DIR").is_some() {
+        return if cfg!(debug_assertions) { "cargo run --".into() } else { "cargo run --release --".into() };
+    }
+    let Ok(path) = std::env::current_exe() else { return "magex".into() };
+    let on_path = std::env::var_os("PATH").is_some_and(|all| {
+        std::env::split_paths(&all).any(|folder| folder.join("magex").canonicalize().is_ok_and(|p| p == path))
+    });
+    if on_path {
+        return "magex".into();
+    }
+    let here = std::env::current_dir().unwrap_or_default();
+    path.strip_prefix(&here).map_or_else(|_| path.display().to_string(), |rest| format!("./{}", rest.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_read_well() {
+        assert_eq!(["0", "999", "1,000", "1,234,568"], [0.4, 999.0, 1000.0, 1_234_567.8].map(thousands).each_ref().map(|s| s.as_str()));
+        assert_eq!(["0.9999", "1.0000", "0.1235"], [0.99999, 1.0, 0.12345].map(share).each_ref().map(|s| s.as_str()));
+        assert_eq!(["9.3 s", "2 min 05 s"], [9.26, 125.9].map(seconds).each_ref().map(|s| s.as_str()));
+    }
+
+    #[test]
+    fn columns_line_up() {
+        let mut table = Table::new(1, &["name", "value"]);
+        table.row(vec!["a".into(), "1.25".into()]);
+        table.row(vec!["longer".into(), "10.25".into()]);
+        assert_eq!(table.to_string(), "  name     value\n  a         1.25\n  longer   10.25");
+    }
+}

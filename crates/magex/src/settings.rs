@@ -1,0 +1,134 @@
+//! The effective configuration of a run: defaults, then the file, then the options of the command.
+
+use crate::failure::usage;
+use anyhow::Context as _;
+use magex_core::config::{ConfigError, ExecutorKind, RunConfig};
+use magex_core::task::{Spawn, TaskConfig};
+use serde::de::DeserializeOwned;
+use std::path::Path;
+
+/// Options that change single keys of the configuration.
+#[derive(Debug, Clone, Default, PartialEq, clap::Args)]
+#[command(next_help_heading = "Configuration (each wins over the file)")]
+pub(crate) struct Overrides {
+    /// Seed of every random stream [run.seed].
+    #[arg(long, value_name = "S")]
+    pub(crate) seed: Option<u64>,
+    /// Budget in joint environment steps [run.max_steps].
+    #[arg(long, value_name = "M")]
+    pub(crate) max_steps: Option<u64>,
+    /// Stop when two evaluations in a row reach this greedy success rate; above 1 never stops early [run.target_success].
+    #[arg(long, value_name = "X")]
+    pub(crate) target_success: Option<f32>,
+    /// Architecture: magex, magex-literal, attention, mlp or local [executor.kind].
+    #[arg(long, value_name = "KIND", value_parser = named::<ExecutorKind>)]
+    pub(crate) executor: Option<ExecutorKind>,
+    /// Team size; side, horizon and layout follow it [task.agents].
+    #[arg(long, value_name = "N")]
+    pub(crate) agents: Option<usize>,
+    /// Starts: uniform, lines, lines-0..3, authors or authors-0..3 [task.spawn].
+    #[arg(long, value_name = "MODE")]
+    pub(crate) spawn: Option<Spawn>,
+}
+
+impl Overrides {
+    /// The configuration with these changes, checked.
+    pub(crate) fn apply(&self, mut config: RunConfig) -> Result<RunConfig, ConfigError> {
+        let run = &mut config.run;
+        run.seed = self.seed.unwrap_or(run.seed);
+        run.max_steps = self.max_steps.unwrap_or(run.max_steps);
+        run.target_success = self.target_success.unwrap_or(run.target_success);
+        config.executor.kind = self.executor.unwrap_or(config.executor.kind);
+        if let Some(agents) = self.agents {
+            resize(&mut config.task, agents);
+        }
+        config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
+        config.resolved()
+    }
+}
+
+/// Changes the team size; what the task derives from it is derived anew.
+pub(crate) fn resize(task: &mut TaskConfig, agents: usize) {
+    if task.agents != agents {
+        let own_unit = task.reward.distance_unit != task.side;
+        (task.agents, task.side, task.horizon, task.layout_scale) = (agents, 0.0, 0, 0.0);
+        if !own_unit {
+            task.reward.distance_unit = 0.0;
+        }
+    }
+}
+
+/// Reads a configuration file, or takes the defaults.
+pub(crate) fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
+    let Some(path) = path else { return Ok(RunConfig::default()) };
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| usage(format!("configuration file {}: {error}", path.display())))?;
+    RunConfig::from_toml(&text).with_context(|| path.display().to_string())
+}
+
+/// Reads the name of something that the configuration knows.
+pub(crate) fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
+    serde_json::from_value(text.into()).map_err(|error| error.to_string().replace("unknown variant", "unknown name"))
+}
+
+/// Cores of this machine.
+pub(crate) fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// A number of threads, at least 1.
+pub(crate) fn threads(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(0) => Err("0 threads do nothing; use 1 or more".into()),
+        Ok(count @ 1..=1024) => Ok(count),
+        _ => Err("use a number from 1 to 1024".into()),
+    }
+}
+
+/// A number of actors, at least 1.
+pub(crate) fn actors(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(count @ 1..=256) => Ok(count),
+        _ => Err("use a number from 1 to 256".into()),
+    }
+}
+
+/// A count of at least 1.
+pub(crate) fn count(text: &str) -> Result<u32, String> {
+    match text.parse() {
+        Ok(count @ 1..=1_000_000) => Ok(count),
+        _ => Err("use a number from 1 to 1000000".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_win_over_the_file_and_nothing_else_changes() {
+        let file = RunConfig::from_toml("[run]\nseed = 3\nmax_steps = 77").unwrap();
+        assert_eq!(Overrides::default().apply(file.clone()).unwrap(), file);
+        let options = Overrides { seed: Some(9), executor: Some(ExecutorKind::Local), ..Overrides::default() };
+        let config = options.apply(file.clone()).unwrap();
+        assert_eq!((config.run.seed, config.run.max_steps), (9, 77));
+        assert_eq!(config.executor.kind, ExecutorKind::Local);
+        assert_eq!(config.task, file.task);
+    }
+
+    #[test]
+    fn another_team_size_brings_its_own_map() {
+        let resized = |agents| Overrides { agents: Some(agents), ..Overrides::default() }.apply(RunConfig::default());
+        let task = resized(5).unwrap().task;
+        assert_eq!((task.side, task.horizon, task.reward.distance_unit), (2.0, 60, 2.0));
+        assert_eq!(resized(50).unwrap(), RunConfig::default());
+        assert!(resized(0).unwrap_err().to_string().contains("task.agents"));
+    }
+
+    #[test]
+    fn names_are_those_of_the_configuration() {
+        assert_eq!(named::<ExecutorKind>("magex-literal"), Ok(ExecutorKind::MagexLiteral));
+        let error = named::<ExecutorKind>("fast").unwrap_err();
+        assert!(error.contains("`fast`") && error.contains("`local`"), "{error}");
+    }
+}

@@ -1,0 +1,118 @@
+use super::*;
+use crate::commander::CommanderPpo;
+use crate::mappo::Mappo;
+use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
+use magex_core::task::{Spawn, TaskConfig};
+
+fn learned() -> Learned {
+    let config = RunConfig {
+        task: TaskConfig::simple_spread(5, Spawn::Uniform),
+        executor: ExecutorConfig { kind: ExecutorKind::Local, hidden: 16, ..ExecutorConfig::default() },
+        ..RunConfig::default()
+    };
+    let executor = Mappo::new(&config).unwrap().start().unwrap();
+    let commander = CommanderPpo::new(&config.commander, 5, 2, 1).start().unwrap();
+    Learned { executor, commander }
+}
+
+fn progress(iteration: u32, learned: &Learned) -> Progress {
+    Progress {
+        format: FORMAT,
+        run_id: "r".into(),
+        config_sha256: "c".into(),
+        iteration,
+        joint_env_steps: 7,
+        on_target: 1,
+        wall_s: 0.1 + 0.2,
+        value_norm: learned.executor.value_norm,
+        adam_steps: [3, 4, 5],
+    }
+}
+
+/// Different in every part from the fresh one.
+fn moved(mut learned: Learned) -> Learned {
+    learned.executor.actor.numbers[3] = 0.1;
+    learned.executor.critic.numbers[0] = -7.25;
+    learned.commander.params.numbers[1] = 1e-20;
+    learned.executor.actor_adam.first[2] = 3e-9;
+    learned.executor.critic_adam.second[1] = 1e-12;
+    learned.commander.adam.first[0] = -1.0;
+    learned.executor.actor_adam.steps = 3;
+    learned.executor.critic_adam.steps = 4;
+    learned.commander.adam.steps = 5;
+    learned.executor.value_norm.update([0.3, 1.7].into_iter());
+    learned
+}
+
+#[test]
+fn everything_that_learning_changes_comes_back_bit_for_bit() {
+    let run = tempfile::tempdir().unwrap();
+    let (fresh, changed) = (learned(), moved(learned()));
+    write(run.path(), &progress(12, &changed), &changed, 3).unwrap();
+    let (p, back, skipped) = read_latest(run.path(), &fresh).unwrap();
+    assert_eq!((p, &back), (progress(12, &changed), &changed));
+    assert!(skipped.is_empty());
+    assert_eq!(back.weights().unwrap(), changed.weights().unwrap());
+}
+
+#[test]
+fn only_the_newest_are_kept_and_the_same_iteration_can_be_written_again() {
+    let run = tempfile::tempdir().unwrap();
+    let state = learned();
+    for iteration in [1, 2, 3, 4, 4] {
+        write(run.path(), &progress(iteration, &state), &state, 2).unwrap();
+    }
+    let names: Vec<_> = list(run.path()).unwrap().iter().map(|p| p.file_name().unwrap().to_owned()).collect();
+    assert_eq!(names, ["000003", "000004"]);
+}
+
+#[test]
+fn a_flipped_byte_in_any_file_is_seen_and_the_previous_checkpoint_is_used() {
+    for file in ["weights.safetensors", "optimiser.safetensors", "state.json", "manifest.json"] {
+        let run = tempfile::tempdir().unwrap();
+        let (old, new) = (learned(), moved(learned()));
+        write(run.path(), &progress(1, &old), &old, 3).unwrap();
+        let folder = write(run.path(), &progress(2, &new), &new, 3).unwrap();
+        let path = folder.join(file);
+        let mut bytes = std::fs::read(&path).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&path, bytes).unwrap();
+        let (p, _, skipped) = read_latest(run.path(), &old).unwrap();
+        assert_eq!(p.iteration, 1, "{file}");
+        assert!(skipped[0].to_string().contains("000002"), "{}", skipped[0]);
+    }
+}
+
+#[test]
+fn a_half_written_or_truncated_checkpoint_never_counts() {
+    let run = tempfile::tempdir().unwrap();
+    let state = learned();
+    write(run.path(), &progress(1, &state), &state, 3).unwrap();
+    // What a kill leaves behind at each step of writing: a temporary folder with some of the files.
+    let temporary = run.path().join("checkpoints/.000002.tmp");
+    std::fs::create_dir(&temporary).unwrap();
+    for file in FILES {
+        std::fs::write(temporary.join(file), b"half").unwrap();
+        assert_eq!(read_latest(run.path(), &state).unwrap().0.iteration, 1);
+    }
+    // The next attempt at the same iteration starts over.
+    write(run.path(), &progress(2, &state), &state, 3).unwrap();
+    assert_eq!(read_latest(run.path(), &state).unwrap().0.iteration, 2);
+    for file in ["manifest.json", "weights.safetensors"] {
+        std::fs::remove_file(run.path().join("checkpoints/000002").join(file)).unwrap();
+        assert_eq!(read_latest(run.path(), &state).unwrap().0.iteration, 1);
+    }
+}
+
+#[test]
+fn no_checkpoint_and_another_architecture_are_clear_errors() {
+    let run = tempfile::tempdir().unwrap();
+    let state = learned();
+    assert!(matches!(read_latest(run.path(), &state), Err(CheckpointError::None(_))));
+    let folder = write(run.path(), &progress(1, &state), &state, 3).unwrap();
+    let mut other = state.clone();
+    other.executor.actor.entries[0].shape.reverse();
+    let error = read(&folder, &other).unwrap_err().to_string();
+    assert!(error.contains("actor.own.weight"), "{error}");
+}

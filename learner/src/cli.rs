@@ -1,0 +1,183 @@
+//! The learner's command line.
+
+use crate::ingest::Limits;
+use crate::service::{LearnerHandle, RunIdentity, learner_service};
+use crate::trainer::{Outcome, Trainer};
+use clap::Args;
+use magex_core::config::RunConfig;
+use magex_core::ids::RunId;
+use magex_runtime::backoff::incarnation;
+use magex_runtime::exit::{self, Failure};
+use magex_runtime::telemetry::{self, LogFormat};
+use magex_runtime::{process, server, shutdown};
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+/// Name of the effective configuration in a run folder.
+pub const CONFIG_FILE: &str = "config.toml";
+
+/// Most episodes that an evaluation shard has: a limit on what is taken in, no more.
+const EVAL_SHARD_LIMIT: u32 = 64;
+
+/// How long the trainer may take to come to the end of its iteration when the process is told to stop. Checkpoints are
+/// written so that leaving at any moment is safe.
+const STOP_BUDGET: Duration = Duration::from_secs(8);
+
+/// Differentiation recurses through the graph.
+const TRAINER_STACK: usize = 64 << 20;
+
+/// Options of a learner. Only `config` (and `seed`) can change a number of the run.
+#[derive(Debug, Clone, Args)]
+pub struct LearnerArgs {
+    /// Configuration of the run; without it the defaults, or when resuming the run's own
+    #[arg(long, env = "MAGEX_CONFIG", value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Seed of the run, in place of the configuration's
+    #[arg(long, env = "MAGEX_SEED")]
+    pub seed: Option<u64>,
+    /// Folder of the run
+    #[arg(long, env = "MAGEX_OUT", default_value = "runs/run", value_name = "FOLDER")]
+    pub out: PathBuf,
+    /// Continue the run in that folder
+    #[arg(long, env = "MAGEX_RESUME")]
+    pub resume: bool,
+    /// Address to listen on; port 0 is any free one
+    #[arg(long, env = "MAGEX_LEARNER_LISTEN", default_value = "127.0.0.1:7000", value_name = "HOST:PORT")]
+    pub listen: String,
+    /// An actor that says nothing for so long loses its leases
+    #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS")]
+    pub lease_seconds: f64,
+    /// Training threads [default: one per processor]
+    #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
+    pub threads: usize,
+    /// How log lines look
+    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
+    pub log_format: LogFormat,
+    /// Print the run's configuration in effect and exit
+    #[arg(long)]
+    pub print_config: bool,
+}
+
+/// Trains until the run is complete or told to stop. The exit code, or why it failed.
+pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
+    let config = configure(&args)?;
+    let toml = config.to_toml().map_err(Failure::usage)?;
+    if args.print_config {
+        process::print(&toml);
+        return Ok(exit::OK);
+    }
+    let lease = Duration::try_from_secs_f64(args.lease_seconds)
+        .ok()
+        .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
+        .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
+    telemetry::init(args.log_format);
+    let trainer = prepare(&args, &config, &toml)?;
+    let identity = RunIdentity {
+        run_id: trainer.run_id().clone(),
+        name: args.out.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
+        task_fingerprint: config.task.fingerprint(),
+        run_config_toml: toml,
+        seed: config.run.seed,
+        lease,
+    };
+    let most = (config.mappo.episodes / config.mappo.shards).max(EVAL_SHARD_LIMIT);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("magex-net")
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    let (handle, mut collector) = learner_service(identity, Limits::for_task(&config.task, most as usize));
+    let end = runtime.block_on(async {
+        let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
+        let (incoming, address) =
+            server::bind(&args.listen).await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
+        process::announce_ready("learner", Some(address));
+        let serving = tokio::spawn(serve(handle, incoming, stop.clone()));
+        let (ended, training_end) = tokio::sync::oneshot::channel();
+        let mut trainer = trainer;
+        std::thread::Builder::new()
+            .name("magex-train".to_owned())
+            .stack_size(TRAINER_STACK)
+            .spawn(move || {
+                // Nobody listens when the process is going down.
+                let _ = ended.send(trainer.run(&mut collector));
+            })
+            .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+        let outcome = tokio::select! {
+            outcome = training_end => Some(outcome),
+            () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
+        };
+        // Tells the actors, ends the streams, closes the port.
+        stop.cancel();
+        serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
+        match outcome {
+            Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
+            Some(Err(_)) => Err(Failure::new(exit::INTERNAL, "the training thread died")),
+            None => Ok(None),
+        }
+    });
+    runtime.shutdown_background();
+    let reason = match end? {
+        Some(Outcome::Finished(_)) => return Ok(exit::OK),
+        Some(Outcome::Stopped(reason)) => reason.to_string(),
+        None => "the iteration did not end in time; its last checkpoint stands".to_owned(),
+    };
+    tracing::info!(reason, "stopped; continue with --resume --out {}", args.out.display());
+    Ok(exit::TEMPORARY)
+}
+
+async fn serve(
+    handle: LearnerHandle,
+    incoming: tonic::transport::server::TcpIncoming,
+    stop: CancellationToken,
+) -> Result<(), Failure> {
+    handle.serve(incoming, stop).await.map_err(|error| Failure::new(exit::INTERNAL, error))
+}
+
+/// The configuration in effect: flags over environment over file; when resuming, the run's own file.
+fn configure(args: &LearnerArgs) -> Result<RunConfig, Failure> {
+    let own = args.out.join(CONFIG_FILE);
+    let path = match &args.config {
+        Some(path) => Some(path.clone()),
+        None => args.resume.then_some(own),
+    };
+    let mut config = match path {
+        Some(path) => {
+            let named = |error: &dyn Display| Failure::usage(format!("{}: {error}", path.display()));
+            let text = std::fs::read_to_string(&path).map_err(|error| named(&error))?;
+            RunConfig::from_toml(&text).map_err(|error| named(&error))?
+        }
+        None => RunConfig::from_toml("").map_err(Failure::usage)?,
+    };
+    if let Some(seed) = args.seed {
+        config.run.seed = seed;
+    }
+    Ok(config)
+}
+
+fn prepare(args: &LearnerArgs, config: &RunConfig, toml: &str) -> Result<Trainer, Failure> {
+    let failed = |error: &dyn Display| Failure::new(exit::FAILURE, error);
+    if args.resume {
+        let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads).map_err(|error| failed(&error))?;
+        for problem in skipped {
+            tracing::warn!(%problem, "skipped a checkpoint");
+        }
+        return Ok(trainer);
+    }
+    create_folder(&args.out, toml)?;
+    let run_id = RunId(format!("{:016x}", incarnation()));
+    Trainer::create(config, run_id, &args.out, args.threads).map_err(|error| failed(&error))
+}
+
+/// A new run never touches the folder of another.
+fn create_folder(out: &Path, toml: &str) -> Result<(), Failure> {
+    let named = |error: &dyn Display| Failure::new(exit::CANNOT_CREATE, format!("{}: {error}", out.display()));
+    if out.join(CONFIG_FILE).exists() {
+        return Err(named(&"there is a run already; continue it with --resume, or choose another --out"));
+    }
+    std::fs::create_dir_all(out).map_err(|error| named(&error))?;
+    std::fs::write(out.join(CONFIG_FILE), toml).map_err(|error| named(&error))
+}

@@ -1,0 +1,22 @@
+//! The learner as a process of its own.
+
+use clap::Parser;
+use magex_learner::cli::{LearnerArgs, run};
+use magex_runtime::exit::{self, Failure};
+use magex_runtime::process::ensure_single_threaded_math;
+use std::process::ExitCode;
+
+/// Trains a team of agents with the episodes that MAGE-X actors roll out.
+#[derive(Debug, Parser)]
+#[command(name = "magex-learner", version)]
+struct Command {
+    #[command(flatten)]
+    args: LearnerArgs,
+}
+
+fn main() -> ExitCode {
+    if let Err(error) = ensure_single_threaded_math() {
+        return exit::report(Err(Failure::new(exit::INTERNAL, error)));
+    }
+    exit::run(|command: Command| run(command.args))
+}
