@@ -13,9 +13,9 @@ pub struct TeamRequest {
     pub goal_count: usize,
     /// D: space dimensions.
     pub dims: usize,
-    /// [N, D] world units.
+    /// `[N, D]` world units.
     pub agents: Vec<f32>,
-    /// [G, D] world units.
+    /// `[G, D]` world units.
     pub goals: Vec<f32>,
     /// How the goals are chosen.
     pub mode: Mode,
@@ -26,9 +26,9 @@ pub struct TeamRequest {
 /// The assignment of one team.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TeamReply {
-    /// [N] the goal of each agent; no goal twice, and `None` only when goals run out.
+    /// `[N]` the goal of each agent; no goal twice, and `None` only when goals run out.
     pub goals: Vec<Option<u32>>,
-    /// [N] probability that the policy gave to each agent's goal, if it has one.
+    /// `[N]` probability that the policy gave to each agent's goal, if it has one.
     pub probabilities: Option<Vec<f32>>,
 }
 

@@ -141,7 +141,7 @@ impl Collector for GrpcCollector {
             let own = &self.shared.run.run_id;
             return Err(CollectError::Other(format!("weights of run '{}' published to run '{own}'", weights.run_id)));
         }
-        self.shared.board.publish(weights.clone());
+        self.shared.publish(weights.clone());
         Ok(())
     }
 

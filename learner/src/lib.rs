@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod batch;
+pub mod bench;
 pub mod checkpoint;
 pub mod collector;
 pub mod commander;

@@ -5,7 +5,7 @@ use crate::events::Events;
 use crate::ingest::Limits;
 use crate::ledger::{GivenUp, Ledger, PlanError, SessionId};
 use crate::service::RunIdentity;
-use crate::weights::Board;
+use crate::weights::{Board, Weights};
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1;
@@ -185,6 +185,12 @@ impl Shared {
             }
         }
         self.events.push(event);
+    }
+
+    /// Makes weights known. Iteration k uses version k: so many iterations are done, in this process or before it.
+    pub(crate) fn publish(&self, weights: Arc<Weights>) {
+        lock(&self.progress).iterations = weights.version.0;
+        self.board.publish(weights);
     }
 
     pub(crate) fn finished(&self) -> bool {

@@ -79,22 +79,22 @@ pub struct GoalRequest {
     pub goal_count: usize,
     /// D: space dimensions.
     pub dims: usize,
-    /// [B, N, D] world units, with B = `shard.episodes`.
+    /// `[B, N, D]` world units, with B = `shard.episodes`.
     pub agents: Vec<f32>,
-    /// [B, G, D] world units.
+    /// `[B, G, D]` world units.
     pub goals: Vec<f32>,
 }
 
 /// The assignments of one shard.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GoalReply {
-    /// [B, N] the goal of each agent.
+    /// `[B, N]` the goal of each agent.
     pub goals: Vec<u32>,
-    /// [B] log-probability of each episode's assignment (0 unless learned).
+    /// `[B]` log-probability of each episode's assignment (0 unless learned).
     pub log_probs: Vec<f32>,
-    /// [B] summed distance of each episode's assignment, world units.
+    /// `[B]` summed distance of each episode's assignment, world units.
     pub costs: Vec<f32>,
-    /// [B] least summed distance possible, world units.
+    /// `[B]` least summed distance possible, world units.
     pub exact_costs: Vec<f32>,
 }
 

@@ -1,1 +1,63 @@
-//! magex-tests
+//! What the tests across crates and processes share.
+
+pub mod sandbox;
+
+use magex::local::LocalCollector;
+use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::ids::RunId;
+use magex_learner::collector::RunEvent;
+use magex_learner::trainer::{Outcome, Trainer};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::{Receiver, channel};
+
+/// A run that takes a second: N agents, few and short episodes, every part of the system in use.
+pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
+    let text = format!(
+        "[run]\nseed = 5\nmax_steps = {}\ntarget_success = 2.0\neval_every = 2\neval_episodes = 6\nfinal_episodes = 6\n\
+         checkpoint_every = 2\n[task]\nname = 'simple-spread'\nagents = {agents}\nhorizon = 20\nspawn = 'uniform'\n\
+         [executor]\nkind = '{kind}'\nhidden = 32\nneighbours = 3\n\
+         [mappo]\nepisodes = 8\nshards = 4\nepochs = 2\nminibatch = 200\nchunk = 5\n",
+        iterations * 8 * 20
+    );
+    RunConfig::from_toml(&text).unwrap_or_else(|e| panic!("the test's configuration: {e}"))
+}
+
+/// How a run in this process ended, and the SHA-256 of what it learned.
+#[derive(Debug)]
+pub struct Ran {
+    /// Finished or stopped.
+    pub outcome: Outcome,
+    /// Hash of actor, critic and commander.
+    pub sha256: String,
+    /// Events in order.
+    pub events: Vec<RunEvent>,
+}
+
+/// Trains in this process, in a new folder.
+pub fn train(config: &RunConfig, folder: &Path, actors: usize, threads: usize) -> Ran {
+    let trainer = Trainer::create(config, RunId("test".into()), folder, threads).expect("a new run");
+    drive(trainer, config, actors, &Arc::new(AtomicBool::new(false)))
+}
+
+/// Drives a trainer to its end or until `stop` is set.
+pub fn drive(mut trainer: Trainer, config: &RunConfig, actors: usize, stop: &Arc<AtomicBool>) -> Ran {
+    let (sender, receiver): (_, Receiver<RunEvent>) = channel();
+    let mut collector = LocalCollector::new(config, actors, sender, stop.clone());
+    let outcome = trainer.run(&mut collector).expect("training");
+    drop(collector);
+    let weights = trainer.learned().weights().expect("weights");
+    Ran { outcome, sha256: magex_learner::checkpoint::sha256_hex(&weights), events: receiver.iter().collect() }
+}
+
+/// The `executor` part of every metrics line.
+pub fn updates(events: &[RunEvent]) -> Vec<serde_json::Value> {
+    events
+        .iter()
+        .filter_map(|event| match event {
+            RunEvent::Iteration(report) => serde_json::from_str::<serde_json::Value>(&report.metrics_json).ok(),
+            _ => None,
+        })
+        .collect()
+}

@@ -7,7 +7,7 @@ use magex_core::config::RunConfig;
 use magex_learner::collector::RunEvent;
 use serde::Deserialize;
 use std::io::IsTerminal as _;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Rows between two headings of the table.
 const PAGE: u32 = 40;
@@ -50,6 +50,7 @@ pub(crate) struct Progress {
     rows: u32,
     target: f64,
     colours: bool,
+    last_iteration: Option<Instant>,
 }
 
 impl Progress {
@@ -70,7 +71,7 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, colours: false };
+            return Self { bar: None, rows: 0, target, colours: false, last_iteration: None };
         }
         let colours = colours();
         let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
@@ -84,20 +85,28 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, colours }
+        Self { bar: Some(bar), rows: 0, target, colours, last_iteration: None }
     }
 
     /// Something happened.
     pub(crate) fn event(&mut self, event: &RunEvent) {
         match event {
             RunEvent::Iteration(report) => match serde_json::from_str::<Row>(&report.metrics_json) {
-                Ok(row) => self.row(&row),
+                Ok(row) => {
+                    self.last_iteration = Some(Instant::now());
+                    self.row(&row);
+                }
                 Err(error) => tracing::warn!(%error, "metrics of an iteration cannot be read"),
             },
             RunEvent::Log(text) => tracing::info!("{text}"),
             RunEvent::Checkpoint { iteration, path } => tracing::debug!(%iteration, path, "checkpoint"),
             RunEvent::Finished { .. } => self.status("finished"),
         }
+    }
+
+    /// When the last iteration was reported: the one that reached the target, if it was reached.
+    pub(crate) fn last_iteration(&self) -> Option<Instant> {
+        self.last_iteration
     }
 
     /// Text of the status line.

@@ -2,10 +2,12 @@
 //! `cargo test --release -p magex-tests --test services -- --ignored --nocapture`.
 
 use crate::sandbox::*;
-use magex_core::ids::Shard;
+use magex_core::ids::{RunId, Shard};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::collector::Collector as _;
+use magex_learner::ingest::{Limits, admit};
+use magex_proto::convert::encode_result;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use std::time::Instant;
@@ -42,12 +44,18 @@ async fn trajectories_of_several_megabytes() {
         std::hint::black_box(result_of(&task, shard, &[0]));
     }
     let work = start.elapsed();
-    let bytes = magex_proto::convert::encode_result(
-        &magex_core::ids::RunId("run".into()),
-        "",
-        &result_of(&task, &shards[0], &[0]),
-    )
-    .len();
+    let (run, result) = (RunId("run".into()), result_of(&task, &shards[0], &[0]));
+    let start = Instant::now();
+    let encoded = encode_result(&run, "", &result);
+    let encoding = start.elapsed();
+    let bytes = encoded.len();
+    let start = Instant::now();
+    admit(&Limits::for_task(&task, 32), &run, encoded).unwrap();
+    println!(
+        "encoding {:.2} ms, admitting {:.2} ms",
+        encoding.as_secs_f64() * 1e3,
+        start.elapsed().as_secs_f64() * 1e3
+    );
     let actor = Actor::start(&learner.url, "a", FakeWorker { task, ..FakeWorker::default() });
     until(|| learner.handle.status().actors.len() == 1).await;
     learner.collector.publish(&weights(0)).unwrap();

@@ -1,13 +1,125 @@
-//! `magex bench`
+//! `magex bench`: the tables of docs/results.md, measured on this machine.
+
+mod goals;
+mod runs;
+mod speed;
+
 use crate::cli::Global;
+use crate::output::{Output, Table};
+use magex_runtime::exit;
+use serde_json::{Map, Value, json};
 
-const AFTER_HELP: &str = "Examples:\n\nExit codes:";
+const AFTER_HELP: &str = "\
+Examples:
+  magex bench                                       env, update, assign and commander: a few minutes
+  magex bench update --json
+  magex bench commander --run runs/mine
+  magex bench train --agents 50 --seeds 1,2,3       trains and evaluates; the result table
+  magex bench distributed                           services against one process
 
-/// Measure.
+Timings are medians on one core (unless a table says otherwise) and as noisy as the machine is busy: compare ratios taken
+in one go, not numbers from different days. What is not a time is the same on every machine.
+
+Exit codes: 0 done, 1 something failed, 64 wrong usage or configuration";
+
+/// Measure: environment, update, solvers, commander, services, whole trainings.
 #[derive(Debug, Clone, clap::Args)]
-#[command(after_help = AFTER_HELP)]
-pub(crate) struct BenchArgs {}
+#[command(after_help = AFTER_HELP, subcommand_value_name = "WHAT", subcommand_help_heading = "What")]
+pub(crate) struct BenchArgs {
+    #[command(subcommand)]
+    what: Option<What>,
+}
 
-pub(crate) fn run(_: &BenchArgs, _: &Global) -> anyhow::Result<u8> {
-    Ok(0)
+#[derive(Debug, Clone, clap::Subcommand)]
+enum What {
+    /// Environment stepping alone: joint steps per second of one core.
+    Env(speed::EnvArgs),
+    /// One PPO minibatch on one core.
+    Update(speed::UpdateArgs),
+    /// Exact assignment.
+    Assign,
+    /// Cost of the commander's assignments over the exact ones.
+    Commander(goals::CommanderArgs),
+    /// Train the paper's ranking commander alone, on instances of each layout.
+    Ranking(goals::RankingArgs),
+    /// Services with two actor processes against the same work in one process.
+    Distributed(runs::DistributedArgs),
+    /// Train and evaluate every size, executor and seed.
+    Train(runs::TrainArgs),
+    /// Weights of one team size on other team sizes.
+    Generalisation(runs::GeneralisationArgs),
+    /// Env, update, assign, commander, ranking, distributed and train.
+    All,
+}
+
+/// One table.
+pub(super) struct Report {
+    /// Key in the JSON object.
+    name: &'static str,
+    /// What is measured.
+    title: String,
+    table: Table,
+    rows: Vec<Value>,
+    /// What else is to be known.
+    notes: Vec<String>,
+    failed: bool,
+}
+
+impl Report {
+    fn new(name: &'static str, title: impl Into<String>, left: usize, heading: &[&str]) -> Self {
+        let table = Table::new(left, heading);
+        Self { name, title: title.into(), table, rows: Vec::new(), notes: Vec::new(), failed: false }
+    }
+
+    fn row(&mut self, cells: Vec<String>, value: Value) {
+        self.table.row(cells);
+        self.rows.push(value);
+    }
+}
+
+pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
+    let quick = || [What::Env(Default::default()), What::Update(Default::default()), What::Assign, What::Commander(Default::default())];
+    let parts = match &args.what {
+        None => quick().to_vec(),
+        Some(What::All) => {
+            let long = [
+                What::Ranking(Default::default()),
+                What::Distributed(Default::default()),
+                What::Train(Default::default()),
+            ];
+            quick().into_iter().chain(long).collect()
+        }
+        Some(one) => vec![one.clone()],
+    };
+    let output = global.output();
+    let (mut all, mut failed) = (Map::new(), false);
+    for part in &parts {
+        let report = measure(part)?;
+        show(&report, output);
+        failed |= report.failed;
+        all.insert(report.name.into(), json!({ "rows": report.rows, "notes": report.notes }));
+    }
+    output.result(&Value::Object(all));
+    Ok(if failed { exit::FAILURE } else { exit::OK })
+}
+
+fn measure(what: &What) -> anyhow::Result<Report> {
+    match what {
+        What::Env(args) => speed::env(args),
+        What::Update(args) => speed::update(args),
+        What::Assign => speed::assign(),
+        What::Commander(args) => goals::commander(args),
+        What::Ranking(args) => goals::ranking(args),
+        What::Distributed(args) => runs::distributed(args),
+        What::Train(args) => runs::train(args),
+        What::Generalisation(args) => runs::generalisation(args),
+        What::All => Err(anyhow::anyhow!("all is not a table")),
+    }
+}
+
+fn show(report: &Report, output: Output) {
+    output.say(format!("{}\n\n{}\n", report.title, report.table));
+    for note in &report.notes {
+        output.say(format!("  {note}\n"));
+    }
 }

@@ -119,7 +119,9 @@ pub(crate) fn run(args: &TrainArgs, global: &Global) -> anyhow::Result<u8> {
             if let Err(error) = write_recorded_replay(&job.folder, &job.config) {
                 tracing::warn!("no replay.html: {error:#}");
             }
-            finished(&job, args.in_process, clock.elapsed().as_secs_f64(), output)
+            let span = |end: Instant| (end - clock).as_secs_f64();
+            let walls = Walls { command_s: span(Instant::now()), training_s: progress.last_iteration().map(span) };
+            finished(&job, args.in_process, walls, output)
         }
         End::Stopped => Ok(stopped(&job, output)),
     }
@@ -229,7 +231,15 @@ struct Summary {
     weights_sha256: String,
 }
 
-fn finished(job: &Job, in_process: bool, command_wall_s: f64, output: Output) -> anyhow::Result<u8> {
+/// Seconds since the command began.
+struct Walls {
+    /// Until its end.
+    command_s: f64,
+    /// Until the last iteration was reported, so until the target was reached if it was.
+    training_s: Option<f64>,
+}
+
+fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow::Result<u8> {
     let path = job.folder.join(folder::SUMMARY);
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     let mut value: Value = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
@@ -243,7 +253,7 @@ fn finished(job: &Job, in_process: bool, command_wall_s: f64, output: Output) ->
         ("collisions", format!("{:.4} per agent and step", s.collisions_per_agent_step)),
         ("assignment cost", format!("{:.4} of the exact one", s.cost_ratio)),
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
-        ("wall time", format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(command_wall_s))),
+        ("wall time", format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(walls.command_s))),
         ("weights sha256", s.weights_sha256),
     ];
     let out = job.folder.display();
@@ -258,7 +268,8 @@ fn finished(job: &Job, in_process: bool, command_wall_s: f64, output: Output) ->
     }
     output.say(format!("  open {out}/replay.html and {out}/curve.svg"));
     if let Value::Object(map) = &mut value {
-        map.insert("command_wall_s".into(), json!(command_wall_s));
+        map.insert("command_wall_s".into(), json!(walls.command_s));
+        map.insert("target_wall_s".into(), json!(walls.training_s));
         map.insert("out".into(), json!(job.folder));
         map.insert("in_process".into(), json!(in_process));
     }

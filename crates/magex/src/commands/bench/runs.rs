@@ -1,0 +1,338 @@
+//! Whole runs, as a user would start them: `magex train` and `magex eval` as child processes.
+
+use super::Report;
+use crate::failure::usage;
+use crate::folder;
+use crate::output::{note, seconds, share, thousands};
+use crate::settings::named;
+use anyhow::{Context as _, bail};
+use magex_core::config::ExecutorKind;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// Where runs are kept, if they are.
+#[derive(Debug, Clone, Default, clap::Args)]
+pub(super) struct Keep {
+    /// Keep the run folders here [default: a temporary folder, removed at the end].
+    #[arg(long, value_name = "DIR")]
+    keep: Option<PathBuf>,
+}
+
+/// A folder for runs that cleans up after itself unless it is to be kept.
+struct Place {
+    path: PathBuf,
+    temporary: bool,
+}
+
+impl Keep {
+    fn place(&self) -> anyhow::Result<Place> {
+        let own = || std::env::temp_dir().join(format!("magex-bench-{}", std::process::id()));
+        let path = self.keep.clone().unwrap_or_else(own);
+        std::fs::create_dir_all(&path).map_err(|e| crate::failure::cannot_create(format!("{}: {e}", path.display())))?;
+        Ok(Place { path, temporary: self.keep.is_none() })
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        if self.temporary {
+            let _ = std::fs::remove_dir_all(&self.path);
+        }
+    }
+}
+
+/// Runs this program and returns the JSON object that it prints.
+fn magex(arguments: &[String]) -> anyhow::Result<Value> {
+    let line = arguments.join(" ");
+    let output = Command::new(std::env::current_exe()?)
+        .args(arguments)
+        .arg("--json")
+        .stdin(Stdio::null())
+        .output()
+        .with_context(|| format!("magex {line}"))?;
+    let stdout = String::from_utf8_lossy(&output.stdout);
+    let value: Value = serde_json::from_str(stdout.lines().last().unwrap_or_default()).unwrap_or_default();
+    if !output.status.success() {
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        bail!("magex {line}: {}: {}", output.status, stderr.lines().last().unwrap_or_default());
+    }
+    Ok(value)
+}
+
+/// A number of a JSON object.
+fn number(value: &Value, key: &str) -> f64 {
+    value[key].as_f64().unwrap_or(f64::NAN)
+}
+
+fn strings(parts: &[&str]) -> Vec<String> {
+    parts.iter().map(|&part| part.to_owned()).collect()
+}
+
+/// Options of `bench distributed`.
+#[derive(Debug, Clone, clap::Args)]
+pub(super) struct DistributedArgs {
+    /// Configuration of the runs.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Executors.
+    #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_parser = named::<ExecutorKind>, default_value = "magex,local")]
+    executors: Vec<ExecutorKind>,
+    /// Joint steps of each run.
+    #[arg(long, value_name = "M", default_value_t = 9600)]
+    max_steps: u64,
+    /// Actor processes.
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    actors: usize,
+    /// Pairs of runs; the median ratio counts.
+    #[arg(long, value_name = "K", default_value_t = 3)]
+    rounds: usize,
+    #[command(flatten)]
+    keep: Keep,
+}
+
+impl Default for DistributedArgs {
+    fn default() -> Self {
+        Self {
+            config: None,
+            executors: vec![ExecutorKind::Magex, ExecutorKind::Local],
+            max_steps: 9600,
+            actors: 2,
+            rounds: 3,
+            keep: Keep::default(),
+        }
+    }
+}
+
+pub(super) fn distributed(args: &DistributedArgs) -> anyhow::Result<Report> {
+    let place = args.keep.place()?;
+    let title = format!(
+        "{} joint steps with services and {} actor processes against one process, all cores; median of {}",
+        thousands(args.max_steps as f64),
+        args.actors,
+        args.rounds
+    );
+    let heading = ["executor", "in process", "services", "ratio", "command ratio", "same weights"];
+    let mut report = Report::new("distributed", title, 1, &heading);
+    for executor in &args.executors {
+        let (mut pairs, mut same) = (Vec::new(), true);
+        for round in 0..args.rounds {
+            let run = |how: &str, more: &[String]| {
+                let out = place.path.join(format!("{executor}-{how}-{round}")).display().to_string();
+                let steps = args.max_steps.to_string();
+                let mut line = strings(&["train", "--out", &out, "--max-steps", &steps, "--target-success", "2"]);
+                line.extend(strings(&["--executor", &executor.to_string()]));
+                line.extend_from_slice(more);
+                line.extend(args.config.iter().map(|path| path.display().to_string()));
+                magex(&line)
+            };
+            let alone = run("alone", &strings(&["--in-process"]))?;
+            let services = run("services", &strings(&["--actors", &args.actors.to_string()]))?;
+            same &= alone["weights_sha256"] == services["weights_sha256"] && alone["weights_sha256"].is_string();
+            note(format!(
+                "{executor} {}: {} in process, {} with services",
+                round + 1,
+                seconds(number(&alone, "wall_s")),
+                seconds(number(&services, "wall_s"))
+            ));
+            pairs.push((alone, services));
+        }
+        let median = |of: &dyn Fn(&(Value, Value)) -> f64| {
+            let mut all: Vec<f64> = pairs.iter().map(of).collect();
+            all.sort_unstable_by(f64::total_cmp);
+            all.get(all.len() / 2).copied().unwrap_or(f64::NAN)
+        };
+        let alone = median(&|(alone, _)| number(alone, "wall_s"));
+        let services = median(&|(_, services)| number(services, "wall_s"));
+        let ratio = median(&|(a, s)| number(s, "wall_s") / number(a, "wall_s"));
+        let command = median(&|(a, s)| number(s, "command_wall_s") / number(a, "command_wall_s"));
+        let cells = vec![
+            executor.to_string(),
+            seconds(alone),
+            seconds(services),
+            format!("{ratio:.3}"),
+            format!("{command:.3}"),
+            if same { "yes" } else { "NO" }.into(),
+        ];
+        let value = json!({
+            "executor": executor, "in_process_s": alone, "services_s": services, "ratio": ratio,
+            "command_ratio": command, "same_weights": same, "actors": args.actors, "max_steps": args.max_steps,
+        });
+        report.failed |= !same;
+        report.row(cells, value);
+    }
+    report.notes.push("ratio: training alone. command ratio: from the command to its end, closing evaluation included.".into());
+    Ok(report)
+}
+
+/// Options of `bench train`.
+#[derive(Debug, Clone, clap::Args)]
+pub(super) struct TrainArgs {
+    /// Folder with <task>-<N>-<executor>.toml or <task>-<N>.toml; what is not there takes the defaults.
+    #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
+    configs: PathBuf,
+    /// Team sizes.
+    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "50,20,5")]
+    agents: Vec<usize>,
+    /// Executors.
+    #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_parser = named::<ExecutorKind>, default_value = "magex,local")]
+    executors: Vec<ExecutorKind>,
+    /// Seeds.
+    #[arg(long, value_name = "S,…", value_delimiter = ',', default_value = "1,2,3")]
+    seeds: Vec<u64>,
+    /// Episodes of each evaluation.
+    #[arg(long, value_name = "K", default_value_t = 100)]
+    episodes: u32,
+    /// Budget in joint steps [default: the configuration's].
+    #[arg(long, value_name = "M")]
+    max_steps: Option<u64>,
+    /// Train to the end of the budget.
+    #[arg(long)]
+    whole_budget: bool,
+    /// Train in one process.
+    #[arg(long)]
+    in_process: bool,
+    #[command(flatten)]
+    keep: Keep,
+}
+
+impl Default for TrainArgs {
+    fn default() -> Self {
+        Self {
+            configs: "deploy/configs".into(),
+            agents: vec![50, 20, 5],
+            executors: vec![ExecutorKind::Magex, ExecutorKind::Local],
+            seeds: vec![1, 2, 3],
+            episodes: 100,
+            max_steps: None,
+            whole_budget: false,
+            in_process: false,
+            keep: Keep::default(),
+        }
+    }
+}
+
+/// The configuration for a size and executor, if there is one.
+fn config_for(folder: &Path, agents: usize, executor: ExecutorKind) -> Option<PathBuf> {
+    [format!("simple-spread-{agents}-{executor}.toml"), format!("simple-spread-{agents}.toml")]
+        .map(|name| folder.join(name))
+        .into_iter()
+        .find(|path| path.is_file())
+}
+
+pub(super) fn train(args: &TrainArgs) -> anyhow::Result<Report> {
+    let place = args.keep.place()?;
+    let title = format!(
+        "Training, then {} unseen episodes per seed; seeds {:?}; {}",
+        args.episodes,
+        args.seeds,
+        if args.in_process { "one process" } else { "services and two actor processes" }
+    );
+    let heading = [
+        "executor", "N", "joint steps", "to target", "success", "all covered", "sampled", "arrival", "scripted", "collisions",
+        "cost",
+    ];
+    let mut report = Report::new("train", title, 1, &heading);
+    for &agents in &args.agents {
+        for &executor in &args.executors {
+            let (mut runs, mut evals, mut yardsticks) = (Vec::new(), Vec::new(), Vec::new());
+            for &seed in &args.seeds {
+                let out = place.path.join(format!("{agents}-{executor}-s{seed}")).display().to_string();
+                let seed = seed.to_string();
+                let mut line = strings(&["train", "--out", &out, "--seed", &seed, "--agents", &agents.to_string()]);
+                line.extend(strings(&["--executor", &executor.to_string()]));
+                line.extend(config_for(&args.configs, agents, executor).map(|path| path.display().to_string()));
+                line.extend(args.max_steps.into_iter().flat_map(|steps| strings(&["--max-steps", &steps.to_string()])));
+                line.extend(args.whole_budget.then(|| strings(&["--target-success", "2"])).into_iter().flatten());
+                line.extend(args.in_process.then(|| "--in-process".to_owned()));
+                let run = magex(&line)?;
+                let count = args.episodes.to_string();
+                let eval = magex(&strings(&["eval", &out, "--episodes", &count]))?;
+                yardsticks.push(magex(&strings(&["eval", &out, "--episodes", &count, "--controller", "scripted", "--scheduler", "exact"]))?);
+                note(format!(
+                    "N = {agents}, {executor}, seed {seed}: {} steps, {}, success {}",
+                    thousands(number(&run, "joint_env_steps")),
+                    seconds(number(&run, "target_wall_s")),
+                    share(number(&eval["mean"]["greedy"], "success_rate"))
+                ));
+                runs.push(run);
+                evals.push(eval);
+            }
+            let mean = |all: &[Value], get: &dyn Fn(&Value) -> f64| all.iter().map(get).sum::<f64>() / all.len().max(1) as f64;
+            let worst = |all: &[Value], get: &dyn Fn(&Value) -> f64| all.iter().map(get).fold(f64::NEG_INFINITY, f64::max);
+            let greedy = |key: &'static str| mean(&evals, &move |e| number(&e["mean"]["greedy"], key));
+            let sampled = mean(&evals, &|e| number(&e["mean"]["sampled"], "success_rate"));
+            let scripted = mean(&yardsticks, &|e| number(&e["mean"]["greedy"], "arrival_step"));
+            let (steps, wall) =
+                (worst(&runs, &|r| number(r, "joint_env_steps")), worst(&runs, &|r| number(r, "target_wall_s")));
+            let reached = runs.iter().all(|run| run["target_reached"] == true);
+            let cells = vec![
+                executor.to_string(),
+                agents.to_string(),
+                thousands(steps),
+                if reached { seconds(wall) } else { format!("({})", seconds(wall)) },
+                share(greedy("success_rate")),
+                share(greedy("all_covered_rate")),
+                share(sampled),
+                format!("{:.1}", greedy("arrival_step")),
+                format!("{scripted:.1}"),
+                format!("{:.4}", greedy("collisions_per_agent_step")),
+                format!("{:.4}", greedy("cost_ratio")),
+            ];
+            let value = json!({ "agents": agents, "executor": executor, "runs": runs, "evaluations": evals, "scripted": yardsticks });
+            report.row(cells, value);
+        }
+    }
+    report.notes.push(
+        "joint steps and time to target are the worst seed's, the rest are means; a time in brackets did not reach the target. \
+         scripted: arrival step of the scripted controller with exact goals."
+            .into(),
+    );
+    Ok(report)
+}
+
+/// Options of `bench generalisation`.
+#[derive(Debug, Clone, clap::Args)]
+pub(super) struct GeneralisationArgs {
+    /// Run folders, for example of several seeds.
+    #[arg(value_name = "RUN", required = true)]
+    runs: Vec<PathBuf>,
+    /// Team sizes.
+    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "20,50,100,200,1000")]
+    agents: Vec<usize>,
+    /// Episodes per run and size; a tenth of it for 1,000 agents and more.
+    #[arg(long, value_name = "K", default_value_t = 100)]
+    episodes: u32,
+    /// Starts.
+    #[arg(long, value_name = "MODE", default_value = "uniform")]
+    spawn: String,
+}
+
+pub(super) fn generalisation(args: &GeneralisationArgs) -> anyhow::Result<Report> {
+    let title = format!("Other team sizes without training: same density, exact scheduler, greedy, {} starts", args.spawn);
+    let heading = ["run", "N", "episodes", "success", "matched", "all covered", "arrival", "collisions"];
+    let mut report = Report::new("generalisation", title, 1, &heading);
+    for run in &args.runs {
+        folder::config_of(run).map_err(|error| usage(format!("{error:#}")))?;
+        for &agents in &args.agents {
+            let episodes = if agents >= 1000 { args.episodes.div_ceil(10) } else { args.episodes };
+            let (path, count, size) = (run.display().to_string(), episodes.to_string(), agents.to_string());
+            let eval = magex(&strings(&[
+                "eval", &path, "--agents", &size, "--episodes", &count, "--scheduler", "exact", "--mode", "greedy", "--spawn", &args.spawn,
+            ]))?;
+            let mean = &eval["mean"]["greedy"];
+            let cells = vec![
+                path,
+                size,
+                count,
+                share(number(mean, "success_rate")),
+                share(number(mean, "matched_success_rate")),
+                share(number(mean, "all_covered_rate")),
+                format!("{:.1}", number(mean, "arrival_step")),
+                format!("{:.4}", number(mean, "collisions_per_agent_step")),
+            ];
+            report.row(cells, json!({ "run": run, "agents": agents, "mean": mean }));
+        }
+    }
+    Ok(report)
+}

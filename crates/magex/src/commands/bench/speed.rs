@@ -1,0 +1,88 @@
+//! Speed of the parts, one core each.
+
+use super::Report;
+use crate::output::thousands;
+use crate::settings;
+use magex_assign::bench::time_exact;
+use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::task::{Spawn, TaskConfig};
+use magex_env::bench::throughput;
+use magex_learner::bench::minibatch;
+use serde_json::json;
+
+/// Options of `bench env`.
+#[derive(Debug, Clone, clap::Args)]
+pub(super) struct EnvArgs {
+    /// Seconds per team size.
+    #[arg(long, value_name = "S", default_value_t = 2.0)]
+    seconds: f64,
+}
+
+impl Default for EnvArgs {
+    fn default() -> Self {
+        Self { seconds: 2.0 }
+    }
+}
+
+pub(super) fn env(args: &EnvArgs) -> anyhow::Result<Report> {
+    let title = "Environment alone, one core: contacts, collisions, rewards, spawns and metrics included";
+    let mut report = Report::new("env", title, 0, &["N", "worlds", "joint steps/s", "agent steps/s"]);
+    for (agents, worlds) in [(5, 64), (20, 32), (50, 32), (200, 16), (1000, 16)] {
+        let speed = throughput(agents, worlds, args.seconds)?;
+        let cells = [agents as f64, worlds as f64, speed, speed * agents as f64].map(thousands).to_vec();
+        report.row(cells, json!({ "agents": agents, "worlds": worlds, "joint_steps_per_s": speed }));
+    }
+    Ok(report)
+}
+
+/// Options of `bench update`.
+#[derive(Debug, Clone, clap::Args)]
+pub(super) struct UpdateArgs {
+    /// Updates that the median is taken of.
+    #[arg(long, value_name = "K", default_value_t = 9, value_parser = settings::count)]
+    rounds: u32,
+}
+
+impl Default for UpdateArgs {
+    fn default() -> Self {
+        Self { rounds: 9 }
+    }
+}
+
+pub(super) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
+    let title = "One PPO minibatch, one core: actor and critic, forward, loss, backward, Adam";
+    let heading = ["executor", "N", "samples", "ms", "ms with values and advantages"];
+    let mut report = Report::new("update", title, 1, &heading);
+    for (kind, agents) in [
+        (ExecutorKind::Local, 64),
+        (ExecutorKind::Magex, 50),
+        (ExecutorKind::MagexLiteral, 50),
+        (ExecutorKind::Attention, 50),
+        (ExecutorKind::Mlp, 50),
+    ] {
+        let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
+        config.executor.kind = kind;
+        let rounds = if kind == ExecutorKind::Local { args.rounds } else { args.rounds.div_ceil(3) };
+        let time = minibatch(&config, 8, rounds as usize)?;
+        let cells = vec![
+            kind.to_string(),
+            agents.to_string(),
+            time.samples.to_string(),
+            format!("{:.2}", time.gradient_ms),
+            format!("{:.2}", time.update_ms),
+        ];
+        report.row(cells, json!({ "executor": kind, "agents": agents, "time": time }));
+    }
+    Ok(report)
+}
+
+pub(super) fn assign() -> anyhow::Result<Report> {
+    let title = "Exact assignment of N uniform agents to N goals, one core";
+    let mut report = Report::new("assign", title, 0, &["N", "median µs", "instances"]);
+    for (n, instances) in [(5, 2000), (20, 2000), (50, 1000), (200, 200), (1000, 20)] {
+        let time = time_exact(n, instances)?;
+        let cells = vec![n.to_string(), format!("{time:.1}"), instances.to_string()];
+        report.row(cells, json!({ "agents": n, "microseconds": time, "instances": instances }));
+    }
+    Ok(report)
+}

@@ -1,0 +1,130 @@
+//! How long an update takes, for the command line. The clock decides nothing but the number that is reported.
+
+use crate::batch::Batch;
+use crate::mappo::Mappo;
+use crate::trainer::TrainError;
+use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+use magex_core::rng::{Key, Purpose};
+use magex_core::trajectory::{Shape, Trajectory};
+use std::time::Instant;
+
+/// −log-probability of any of five actions under the uniform policy.
+const LN_5: f32 = 1.609_438;
+
+/// What a minibatch takes on one thread, medians in milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct MinibatchTime {
+    /// Agent samples of a minibatch.
+    pub samples: usize,
+    /// Minibatches of an update.
+    pub minibatches: usize,
+    /// A whole update of one epoch, values and advantages included, per minibatch.
+    pub update_ms: f64,
+    /// One more epoch, per minibatch: actor and critic forward, loss, backward, clipping, Adam.
+    pub gradient_ms: f64,
+}
+
+/// Times updates on a synthetic batch of exactly `minibatches` minibatches of the configured size (rounded down to whole
+/// joint states, or chunks of networks with memory) for teams of `config.task.agents` agents.
+///
+/// # Errors
+/// Networks that cannot be built.
+pub fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<MinibatchTime, TrainError> {
+    let mut config = config.clone();
+    let n = config.task.agents;
+    let chunk = if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk };
+    let units = (config.mappo.minibatch / (chunk * n)).max(1);
+    // One episode is one minibatch.
+    config.task.horizon = (units * chunk) as u32;
+    let trajectory = synthetic(&config, minibatches);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .stack_size(64 << 20)
+        .build()
+        .map_err(|e| TrainError::Configuration(format!("training threads: {e}")))?;
+    pool.install(|| {
+        let mut time = [Vec::new(), Vec::new()];
+        for round in 0..=rounds {
+            for (epochs, times) in (1u32..).zip(&mut time) {
+                config.mappo.epochs = epochs;
+                let mappo = Mappo::new(&config)?;
+                let mut state = mappo.start()?;
+                let batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
+                let clock = Instant::now();
+                mappo.update(&mut state, &batch, 0, 0.0)?;
+                // The first round warms the caches.
+                if round > 0 {
+                    times.push(clock.elapsed().as_secs_f64() * 1e3);
+                }
+            }
+        }
+        let [one, two] = time.map(median);
+        Ok(MinibatchTime {
+            samples: units * chunk * n,
+            minibatches,
+            update_ms: one / minibatches as f64,
+            gradient_ms: (two - one) / minibatches as f64,
+        })
+    })
+}
+
+fn median(mut times: Vec<f64>) -> f64 {
+    times.sort_unstable_by(f64::total_cmp);
+    times.get(times.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+/// B episodes of agents anywhere on the map, doing anything.
+fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
+    let (t, b, n) = (config.task.horizon as usize, episodes, config.task.agents);
+    let shape = Shape { steps: t, episodes: b, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 };
+    let mut stream = Key::new(config.run.seed, Purpose::Bench, &[3]).stream();
+    let half = f64::from(config.task.side / 2.0);
+    let mut within = |limit: f64, count: usize| -> Vec<f32> {
+        (0..count).map(|_| stream.range(-limit, limit) as f32).collect()
+    };
+    let state = (t + 1) * b * n * 2;
+    let (positions, velocities) = (within(half, state), within(1.0, state));
+    let (landmarks, rewards) = (within(half, b * n * 2), within(1.0, t * b * n));
+    Trajectory {
+        shard: Shard {
+            kind: ShardKind::Train,
+            iteration: Iteration(0),
+            index: 0,
+            episodes: b as u32,
+            first_episode: 0,
+            version: WeightsVersion(0),
+            mode: Mode::Sampled,
+            eval_set: 0,
+            record: false,
+        },
+        shape,
+        positions,
+        velocities,
+        landmarks,
+        goals: (0..b * n).map(|i| (i % n) as u32).collect(),
+        actions: (0..t * b * n).map(|_| stream.below(5) as u8).collect(),
+        log_probs: vec![-LN_5; t * b * n],
+        rewards,
+        goal_log_probs: vec![0.0; b],
+        costs: vec![1.0; b],
+        exact_costs: vec![1.0; b],
+        metrics: Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::task::{Spawn, TaskConfig};
+
+    #[test]
+    fn a_batch_is_whole_minibatches() {
+        let mut config = RunConfig { task: TaskConfig::simple_spread(8, Spawn::Uniform), ..RunConfig::default() };
+        config.mappo.minibatch = 256;
+        config.executor.kind = ExecutorKind::Local;
+        let time = minibatch(&config, 2, 1).unwrap();
+        assert_eq!((time.samples, time.minibatches), (256, 2));
+        assert!(time.update_ms > 0.0);
+    }
+}

@@ -1,0 +1,141 @@
+//! The same configuration and seed give the same bits, however the work is spread; within one process. The same across
+//! processes is in `cluster.rs`.
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_learner::checkpoint;
+use magex_learner::trainer::{Outcome, Trainer};
+use magex_tests::{drive, small, train, updates};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+const KINDS: [ExecutorKind; 5] = [
+    ExecutorKind::Magex,
+    ExecutorKind::MagexLiteral,
+    ExecutorKind::Attention,
+    ExecutorKind::Mlp,
+    ExecutorKind::Local,
+];
+
+fn hash(config: &RunConfig, actors: usize, threads: usize) -> String {
+    train(config, tempfile::tempdir().unwrap().path(), actors, threads).sha256
+}
+
+#[test]
+fn neither_actors_nor_training_threads_reach_a_number() {
+    for kind in KINDS {
+        let config = small(kind, 5, 3);
+        let one = hash(&config, 1, 1);
+        assert_eq!(one, hash(&config, 3, 1), "{kind}: three rollout threads");
+        assert_eq!(one, hash(&config, 2, 2), "{kind}: two training threads");
+    }
+}
+
+#[test]
+fn another_seed_learns_something_else() {
+    let config = small(ExecutorKind::Local, 5, 2);
+    let mut other = config.clone();
+    other.run.seed += 1;
+    assert_ne!(hash(&config, 1, 1), hash(&other, 1, 1));
+}
+
+#[test]
+fn a_stopped_and_resumed_run_ends_with_the_same_bits() {
+    for kind in [ExecutorKind::Magex, ExecutorKind::Local] {
+        let config = small(kind, 5, 5);
+        let whole = hash(&config, 2, 1);
+        let folder = tempfile::tempdir().unwrap();
+        // A stop is obeyed at the end of an iteration: with the flag set from the start, each attempt does one.
+        let stop = Arc::new(AtomicBool::new(true));
+        let first = Trainer::create(&config, magex_core::ids::RunId("r".into()), folder.path(), 1).unwrap();
+        assert!(matches!(drive(first, &config, 1, &stop).outcome, Outcome::Stopped(_)));
+        for _ in 0..2 {
+            let (next, skipped) = Trainer::resume(&config, folder.path(), 2).unwrap();
+            assert!(skipped.is_empty());
+            assert!(matches!(drive(next, &config, 2, &stop).outcome, Outcome::Stopped(_)));
+        }
+        let (last, _) = Trainer::resume(&config, folder.path(), 1).unwrap();
+        let ended = drive(last, &config, 3, &Arc::new(AtomicBool::new(false)));
+        assert!(matches!(ended.outcome, Outcome::Finished(_)));
+        assert_eq!(ended.sha256, whole, "{kind}");
+        let lines = std::fs::read_to_string(folder.path().join("metrics.jsonl")).unwrap();
+        let iterations: Vec<u64> = lines
+            .lines()
+            .map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["iteration"].as_u64().unwrap())
+            .collect();
+        assert_eq!(iterations, [1, 2, 3, 4, 5, 5], "one line per iteration and the closing evaluation");
+    }
+}
+
+#[test]
+fn after_a_corrupt_checkpoint_the_previous_one_leads_to_the_same_bits() {
+    let config = small(ExecutorKind::Local, 5, 5);
+    let folder = tempfile::tempdir().unwrap();
+    let whole = train(&config, folder.path(), 1, 1).sha256;
+    let checkpoints = checkpoint::list(folder.path()).unwrap();
+    let newest = checkpoints.last().unwrap().join("weights.safetensors");
+    let mut bytes = std::fs::read(&newest).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 0x40;
+    std::fs::write(&newest, bytes).unwrap();
+    let (again, skipped) = Trainer::resume(&config, folder.path(), 1).unwrap();
+    assert_eq!(skipped.len(), 1);
+    assert!(skipped[0].to_string().contains("checksum"), "{}", skipped[0]);
+    assert_eq!(drive(again, &config, 1, &Arc::new(AtomicBool::new(false))).sha256, whole);
+}
+
+#[test]
+fn a_resume_with_another_configuration_is_refused() {
+    let config = small(ExecutorKind::Local, 5, 2);
+    let folder = tempfile::tempdir().unwrap();
+    train(&config, folder.path(), 1, 1);
+    let mut other = config.clone();
+    other.mappo.gamma = 0.9;
+    let error = Trainer::resume(&other, folder.path(), 1).unwrap_err().to_string();
+    assert!(error.contains("another configuration"), "{error}");
+}
+
+#[test]
+fn the_first_importance_ratio_is_one() {
+    for kind in KINDS {
+        let ran = train(&small(kind, 6, 3), tempfile::tempdir().unwrap().path(), 2, 1);
+        for line in updates(&ran.events).iter().filter(|l| !l["executor"].is_null()) {
+            let error = line["executor"]["first_ratio_error"].as_f64().unwrap();
+            assert!(error <= 1e-6, "{kind}: iteration {} has ratio error {error}", line["iteration"]);
+            let error = line["commander"]["first_ratio_error"].as_f64().unwrap();
+            assert!(error <= 1e-6, "{kind}: the commander's log-probabilities differ by {error}");
+        }
+    }
+}
+
+#[test]
+fn every_scheduler_trains_and_the_learned_ones_change() {
+    for kind in [CommanderKind::Pairwise, CommanderKind::Ranking, CommanderKind::Exact, CommanderKind::Random] {
+        let mut config = small(ExecutorKind::Local, 5, 2);
+        config.commander.kind = kind;
+        let folder = tempfile::tempdir().unwrap();
+        let before = Trainer::create(&config, magex_core::ids::RunId("r".into()), folder.path(), 1)
+            .unwrap()
+            .learned()
+            .commander
+            .clone();
+        let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
+        let Outcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
+        assert!(summary.cost_ratio >= 0.999, "{kind}: better than exact");
+        if kind == CommanderKind::Exact {
+            assert!((summary.cost_ratio - 1.0).abs() < 1e-6);
+        }
+        assert_eq!(before.params.numbers.is_empty(), !kind.learned(), "{kind}");
+    }
+}
+
+#[test]
+fn it_learns() {
+    // Not how fast, only that it does: the default network at N = 5 must beat the untrained one by far.
+    let text = "[run]\nseed = 1\nmax_steps = 12000\ntarget_success = 0.97\neval_episodes = 32\nfinal_episodes = 50\n\
+                [task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'\n[executor]\nkind = 'local'\n";
+    let config = RunConfig::from_toml(text).unwrap();
+    let ran = train(&config, tempfile::tempdir().unwrap().path(), 2, 2);
+    let Outcome::Finished(summary) = ran.outcome else { panic!("not finished") };
+    assert!(summary.success_rate > 0.9, "{summary:?}");
+}
