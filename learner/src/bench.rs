@@ -80,9 +80,8 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
     let shape = Shape { steps: t, episodes: b, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 };
     let mut stream = Key::new(config.run.seed, Purpose::Bench, &[3]).stream();
     let half = f64::from(config.task.side / 2.0);
-    let mut within = |limit: f64, count: usize| -> Vec<f32> {
-        (0..count).map(|_| stream.range(-limit, limit) as f32).collect()
-    };
+    let mut within =
+        |limit: f64, count: usize| -> Vec<f32> { (0..count).map(|_| stream.range(-limit, limit) as f32).collect() };
     let state = (t + 1) * b * n * 2;
     let (positions, velocities) = (within(half, state), within(1.0, state));
     let (landmarks, rewards) = (within(half, b * n * 2), within(1.0, t * b * n));

@@ -1,5 +1,7 @@
 //! What the tests across crates and processes share.
 
+#![allow(clippy::expect_used, clippy::panic, reason = "tests stop where something is not as it should be")]
+
 pub mod sandbox;
 
 use magex::local::LocalCollector;

@@ -36,7 +36,11 @@ pub(crate) fn write_replay(
     let named: Vec<ReplayEpisode<'_>> = episodes
         .iter()
         .enumerate()
-        .map(|(k, (recording, metrics))| ReplayEpisode { name: format!("episode {}", k + 1), recording, metrics: *metrics })
+        .map(|(k, (recording, metrics))| ReplayEpisode {
+            name: format!("episode {}", k + 1),
+            recording,
+            metrics: *metrics,
+        })
         .collect();
     write(path, replay_html(&info, &named)?.as_bytes())
 }

@@ -123,7 +123,8 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
     }
     let template = Learned {
         executor: Mappo::new(config)?.start()?,
-        commander: CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed).start()?,
+        commander: CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed)
+            .start()?,
     };
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));

@@ -53,7 +53,10 @@ impl Crew {
             }
         });
         let results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
-        results.into_iter().map(|r| r.unwrap_or_else(|| Err(CollectError::Other("a rollout thread died".into())))).collect()
+        results
+            .into_iter()
+            .map(|r| r.unwrap_or_else(|| Err(CollectError::Other("a rollout thread died".into()))))
+            .collect()
     }
 }
 

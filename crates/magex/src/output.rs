@@ -136,7 +136,10 @@ mod tests {
 
     #[test]
     fn numbers_read_well() {
-        assert_eq!(["0", "999", "1,000", "1,234,568"], [0.4, 999.0, 1000.0, 1_234_567.8].map(thousands).each_ref().map(|s| s.as_str()));
+        assert_eq!(
+            ["0", "999", "1,000", "1,234,568"],
+            [0.4, 999.0, 1000.0, 1_234_567.8].map(thousands).each_ref().map(|s| s.as_str())
+        );
         assert_eq!(["0.9999", "1.0000", "0.1235"], [0.99999, 1.0, 0.12345].map(share).each_ref().map(|s| s.as_str()));
         assert_eq!(["9.3 s", "2 min 05 s"], [9.26, 125.9].map(seconds).each_ref().map(|s| s.as_str()));
     }

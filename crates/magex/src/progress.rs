@@ -152,7 +152,11 @@ impl Progress {
         let reached = row.success_rate.is_some_and(|success| success >= self.target);
         note(line(row, [collect, update, commander, checkpoint], reached && self.colours));
         bar.set_position(row.joint_env_steps);
-        let next = if row.sampled_success_rate.is_none() { "closing evaluation".into() } else { format!("iteration {}", row.iteration + 1) };
+        let next = if row.sampled_success_rate.is_none() {
+            "closing evaluation".into()
+        } else {
+            format!("iteration {}", row.iteration + 1)
+        };
         bar.set_message(next);
     }
 }
@@ -166,7 +170,15 @@ impl Drop for Progress {
 fn heading() -> String {
     format!(
         "{:>5} {:>10} {:>8} {:>8} {:>8} {:>10} {:>7} {:>8}  {}",
-        "iter", "steps", "success", "sampled", "arrival", "collisions", "cost", "steps/s", "time: collect update commander"
+        "iter",
+        "steps",
+        "success",
+        "sampled",
+        "arrival",
+        "collisions",
+        "cost",
+        "steps/s",
+        "time: collect update commander"
     )
 }
 

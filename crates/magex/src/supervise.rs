@@ -7,7 +7,6 @@ mod service;
 
 use crate::commands::train::{End, Job, trainer};
 use crate::failure::coded;
-use crate::folder;
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
@@ -17,7 +16,7 @@ use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::watch_run_response::Event;
 use magex_runtime::{client, exit, shutdown};
-use service::{Running, Service, keep};
+use service::{Service, keep};
 use std::process::ExitStatus;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -112,7 +111,7 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
             () = interrupted.cancelled(), if !draining => {
                 draining = true;
                 progress.status("finishing the iteration, then writing a checkpoint");
-                note("finishing the iteration, then writing a checkpoint; once more stops at once");
+                note("finishing the iteration, then writing a checkpoint");
                 if let Err(error) = drain(&url).await {
                     tracing::warn!(%error, "the learner cannot be asked to drain; stopping it");
                     running.terminate();
@@ -148,7 +147,8 @@ fn code_of(status: ExitStatus) -> (Option<u8>, ExitStatus) {
 /// A learner that was started again, and a stream that broke, tell of iterations that were shown before.
 fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
     let RunEvent::Iteration(report) = event else { return true };
-    let trained = serde_json::from_str::<serde_json::Value>(&report.metrics_json).is_ok_and(|v| !v["executor"].is_null());
+    let trained =
+        serde_json::from_str::<serde_json::Value>(&report.metrics_json).is_ok_and(|v| !v["executor"].is_null());
     // The last line only evaluates: it has the number of the line before it.
     let place = (report.iteration.0, !trained);
     let new = place > *shown;

@@ -104,9 +104,15 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
     assert_eq!((&summary["iterations"], &summary["agent_steps"]), (&3.into(), &3600.into()));
     let out = "runs/simple-spread-5-local-s3";
     assert_eq!(summary["out"], out);
-    for file in
-        ["config.toml", "metrics.jsonl", "weights.safetensors", "summary.json", "curve.svg", "replay.html", "checkpoints"]
-    {
+    for file in [
+        "config.toml",
+        "metrics.jsonl",
+        "weights.safetensors",
+        "summary.json",
+        "curve.svg",
+        "replay.html",
+        "checkpoints",
+    ] {
         assert!(place.path(out).join(file).exists(), "{file}");
     }
     assert_eq!(fs::read_to_string(place.path(out).join("metrics.jsonl")).unwrap().lines().count(), 4);
@@ -125,7 +131,8 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
     assert!(place.path("look.html").exists());
     let scripted = place.json(&format!("eval {out} --controller scripted --episodes 8"));
     assert_eq!(scripted["mean"]["greedy"]["success_rate"], 1.0);
-    let larger = place.json(&format!("eval {out} --agents 12 --scheduler exact --mode greedy --episodes 2 --spawn lines"));
+    let larger =
+        place.json(&format!("eval {out} --agents 12 --scheduler exact --mode greedy --episodes 2 --spawn lines"));
     assert_eq!((&larger["agents"], &larger["mean"]["greedy"]["cost_ratio"]), (&12.into(), &1.0.into()));
 
     let replay = place.json(&format!("replay {out} --episodes 3 --mode both --out page.html"));
@@ -133,7 +140,8 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
     assert!(fs::read_to_string(place.path("page.html")).unwrap().contains("<html"));
 
     // A weights file from elsewhere.
-    let file = place.json(&format!("eval {out}/weights.safetensors --config {out}/config.toml --episodes 20 --seeds 1,2"));
+    let file =
+        place.json(&format!("eval {out}/weights.safetensors --config {out}/config.toml --episodes 20 --seeds 1,2"));
     assert_eq!(file["mean"], eval["mean"]);
 }
 
@@ -263,7 +271,8 @@ fn a_commander_answers_the_command_line() {
     BufReader::new(commander.stdout.take().unwrap()).read_line(&mut line).unwrap();
     let ready: Value = serde_json::from_str(&line).unwrap();
     let url = format!("http://{}", ready["address"].as_str().unwrap());
-    let answer = place.json(&format!("assign --connect {url} --agents [[0,0],[1,0]] --goals [[1,1],[0,1]] --scheduler exact"));
+    let answer =
+        place.json(&format!("assign --connect {url} --agents [[0,0],[1,0]] --goals [[1,1],[0,1]] --scheduler exact"));
     assert_eq!(answer["pairs"][0]["goal"], 1);
     assert!((answer["cost"].as_f64().unwrap() - 2.0).abs() < 1e-9);
     fs::write(place.path("team.json"), r#"{"agents": [[0, 0], [3, 0]], "goals": [[1, 0]]}"#).unwrap();

@@ -149,7 +149,9 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
     let answered = kind_name(response.scheduler());
     let version = match response.sha256.is_empty() {
         true => String::new(),
-        false => format!(" (version {}, weights {})", response.version, &response.sha256[..12.min(response.sha256.len())]),
+        false => {
+            format!(" (version {}, weights {})", response.version, &response.sha256[..12.min(response.sha256.len())])
+        }
     };
     output.say(format!(
         "\n  summed distance {:.4}, least possible {:.4}, gap {:.2} %\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
@@ -160,7 +162,10 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         1e3 * round_trip
     ));
     if !response.fallback_reason.is_empty() {
-        note(format!("note: {answered} answered instead of {:?}: {}", args.scheduler, response.fallback_reason).to_lowercase());
+        note(
+            format!("note: {answered} answered instead of {:?}: {}", args.scheduler, response.fallback_reason)
+                .to_lowercase(),
+        );
     }
     let pairs = response.pairs.iter().map(|p| {
         json!({ "agent": p.agent_index, "goal": p.goal_index, "distance": p.distance, "probability": p.probability })
@@ -211,7 +216,9 @@ fn team(args: &AssignArgs) -> anyhow::Result<Team> {
     let agents = read("agents", args.agents.as_deref().unwrap_or_default())?;
     let Some(goals) = &args.goals else {
         return serde_json::from_str(&agents).map_err(|error| {
-            usage(format!("--agents: {error}; give {{\"agents\": [[x, y], …], \"goals\": [[x, y], …]}}, or add --goals"))
+            usage(format!(
+                "--agents: {error}; give {{\"agents\": [[x, y], …], \"goals\": [[x, y], …]}}, or add --goals"
+            ))
         });
     };
     let points = |field: &str, text: &str| {

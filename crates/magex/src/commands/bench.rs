@@ -3,6 +3,7 @@
 mod goals;
 mod runs;
 mod speed;
+mod training;
 
 use crate::cli::Global;
 use crate::output::{Output, Table};
@@ -45,7 +46,7 @@ enum What {
     /// Services with two actor processes against the same work in one process.
     Distributed(runs::DistributedArgs),
     /// Train and evaluate every size, executor and seed.
-    Train(runs::TrainArgs),
+    Train(training::TrainArgs),
     /// Weights of one team size on other team sizes.
     Generalisation(runs::GeneralisationArgs),
     /// Env, update, assign, commander, ranking, distributed and train.
@@ -78,7 +79,14 @@ impl Report {
 }
 
 pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
-    let quick = || [What::Env(Default::default()), What::Update(Default::default()), What::Assign, What::Commander(Default::default())];
+    let quick = || {
+        [
+            What::Env(Default::default()),
+            What::Update(Default::default()),
+            What::Assign,
+            What::Commander(Default::default()),
+        ]
+    };
     let parts = match &args.what {
         None => quick().to_vec(),
         Some(What::All) => {
@@ -111,7 +119,7 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Commander(args) => goals::commander(args),
         What::Ranking(args) => goals::ranking(args),
         What::Distributed(args) => runs::distributed(args),
-        What::Train(args) => runs::train(args),
+        What::Train(args) => training::train(args),
         What::Generalisation(args) => runs::generalisation(args),
         What::All => Err(anyhow::anyhow!("all is not a table")),
     }

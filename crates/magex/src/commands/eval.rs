@@ -1,12 +1,12 @@
 //! `magex eval`
 
+use crate::artifacts;
 use crate::cli::Global;
 use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
 use crate::failure::usage;
 use crate::folder;
-use crate::output::{Table, note, share, seconds};
+use crate::output::{Table, note, seconds, share};
 use crate::settings;
-use crate::artifacts;
 use magex_core::ids::Mode;
 use magex_core::task::Spawn;
 use magex_core::trajectory::EpisodeMetrics;
@@ -167,7 +167,17 @@ fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
 }
 
 const HEADING: [&str; 11] = [
-    "spawn", "seed", "mode", "episodes", "success", "matched", "all covered", "arrival", "collisions", "cost", "reward",
+    "spawn",
+    "seed",
+    "mode",
+    "episodes",
+    "success",
+    "matched",
+    "all covered",
+    "arrival",
+    "collisions",
+    "cost",
+    "reward",
 ];
 
 fn cells(spawn: String, seed: String, mode: Mode, summary: &EvalSummary) -> Vec<String> {

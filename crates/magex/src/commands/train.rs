@@ -253,7 +253,10 @@ fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow
         ("collisions", format!("{:.4} per agent and step", s.collisions_per_agent_step)),
         ("assignment cost", format!("{:.4} of the exact one", s.cost_ratio)),
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
-        ("wall time", format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(walls.command_s))),
+        (
+            "wall time",
+            format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(walls.command_s)),
+        ),
         ("weights sha256", s.weights_sha256),
     ];
     let out = job.folder.display();

@@ -7,8 +7,8 @@ use magex_runtime::backoff::Backoff;
 use magex_runtime::exit;
 use rustix::process::{Pid, Signal, kill_process};
 use std::fs::OpenOptions;
-use std::path::{Path, PathBuf};
 use std::os::unix::process::ExitStatusExt as _;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
@@ -157,7 +157,10 @@ pub(super) async fn keep(service: Service, first: Running, stop: CancellationTok
         let code = status.code().and_then(|code| u8::try_from(code).ok());
         if lives == 0 || code.is_some_and(|code| code == exit::USAGE || code == exit::UNAVAILABLE) {
             let log = service.log.display();
-            return Err(coded(code.unwrap_or(exit::FAILURE), format!("the {} failed: {reason} (log: {log})", service.name)));
+            return Err(coded(
+                code.unwrap_or(exit::FAILURE),
+                format!("the {} failed: {reason} (log: {log})", service.name),
+            ));
         }
         tracing::warn!(service = service.name, reason, "died; starting it again");
         if stop.run_until_cancelled(tokio::time::sleep(backoff.next_wait())).await.is_none() {

@@ -81,7 +81,8 @@ fn greedy_of(commander: &Commander) -> impl FnMut(&Team<'_>, u32) -> anyhow::Res
 }
 
 pub(super) fn commander(args: &CommanderArgs) -> anyhow::Result<Report> {
-    let title = format!("Assignment cost over the exact cost, {} unseen instances per row, greedy decisions", args.instances);
+    let title =
+        format!("Assignment cost over the exact cost, {} unseen instances per row, greedy decisions", args.instances);
     let heading = ["commander", "N", "spawn", "mean ratio", "worst", "median µs"];
     let mut report = Report::new("commander", title, 1, &heading);
     let config = RunConfig::default();
@@ -231,7 +232,12 @@ pub(super) fn ranking(args: &RankingArgs) -> anyhow::Result<Report> {
 }
 
 /// Sampled decisions with their advantage over the greedy decision on the same instance.
-fn decisions(args: &RankingArgs, task: &TaskConfig, commander: &Commander, iteration: u32) -> anyhow::Result<Vec<Sample>> {
+fn decisions(
+    args: &RankingArgs,
+    task: &TaskConfig,
+    commander: &Commander,
+    iteration: u32,
+) -> anyhow::Result<Vec<Sample>> {
     (0..args.batch)
         .map(|k| {
             let start = instance(task, TRAIN, iteration * args.batch + k);

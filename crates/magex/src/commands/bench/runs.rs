@@ -8,7 +8,7 @@ use crate::settings::named;
 use anyhow::{Context as _, bail};
 use magex_core::config::ExecutorKind;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 /// Where runs are kept, if they are.
@@ -20,16 +20,17 @@ pub(super) struct Keep {
 }
 
 /// A folder for runs that cleans up after itself unless it is to be kept.
-struct Place {
-    path: PathBuf,
+pub(super) struct Place {
+    pub(super) path: PathBuf,
     temporary: bool,
 }
 
 impl Keep {
-    fn place(&self) -> anyhow::Result<Place> {
+    pub(super) fn place(&self) -> anyhow::Result<Place> {
         let own = || std::env::temp_dir().join(format!("magex-bench-{}", std::process::id()));
         let path = self.keep.clone().unwrap_or_else(own);
-        std::fs::create_dir_all(&path).map_err(|e| crate::failure::cannot_create(format!("{}: {e}", path.display())))?;
+        std::fs::create_dir_all(&path)
+            .map_err(|e| crate::failure::cannot_create(format!("{}: {e}", path.display())))?;
         Ok(Place { path, temporary: self.keep.is_none() })
     }
 }
@@ -43,7 +44,7 @@ impl Drop for Place {
 }
 
 /// Runs this program and returns the JSON object that it prints.
-fn magex(arguments: &[String]) -> anyhow::Result<Value> {
+pub(super) fn magex(arguments: &[String]) -> anyhow::Result<Value> {
     let line = arguments.join(" ");
     let output = Command::new(std::env::current_exe()?)
         .args(arguments)
@@ -61,11 +62,11 @@ fn magex(arguments: &[String]) -> anyhow::Result<Value> {
 }
 
 /// A number of a JSON object.
-fn number(value: &Value, key: &str) -> f64 {
+pub(super) fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or(f64::NAN)
 }
 
-fn strings(parts: &[&str]) -> Vec<String> {
+pub(super) fn strings(parts: &[&str]) -> Vec<String> {
     parts.iter().map(|&part| part.to_owned()).collect()
 }
 
@@ -161,133 +162,9 @@ pub(super) fn distributed(args: &DistributedArgs) -> anyhow::Result<Report> {
         report.failed |= !same;
         report.row(cells, value);
     }
-    report.notes.push("ratio: training alone. command ratio: from the command to its end, closing evaluation included.".into());
-    Ok(report)
-}
-
-/// Options of `bench train`.
-#[derive(Debug, Clone, clap::Args)]
-pub(super) struct TrainArgs {
-    /// Folder with <task>-<N>-<executor>.toml or <task>-<N>.toml; what is not there takes the defaults.
-    #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
-    configs: PathBuf,
-    /// Team sizes.
-    #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "50,20,5")]
-    agents: Vec<usize>,
-    /// Executors.
-    #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_parser = named::<ExecutorKind>, default_value = "magex,local")]
-    executors: Vec<ExecutorKind>,
-    /// Seeds.
-    #[arg(long, value_name = "S,…", value_delimiter = ',', default_value = "1,2,3")]
-    seeds: Vec<u64>,
-    /// Episodes of each evaluation.
-    #[arg(long, value_name = "K", default_value_t = 100)]
-    episodes: u32,
-    /// Budget in joint steps [default: the configuration's].
-    #[arg(long, value_name = "M")]
-    max_steps: Option<u64>,
-    /// Train to the end of the budget.
-    #[arg(long)]
-    whole_budget: bool,
-    /// Train in one process.
-    #[arg(long)]
-    in_process: bool,
-    #[command(flatten)]
-    keep: Keep,
-}
-
-impl Default for TrainArgs {
-    fn default() -> Self {
-        Self {
-            configs: "deploy/configs".into(),
-            agents: vec![50, 20, 5],
-            executors: vec![ExecutorKind::Magex, ExecutorKind::Local],
-            seeds: vec![1, 2, 3],
-            episodes: 100,
-            max_steps: None,
-            whole_budget: false,
-            in_process: false,
-            keep: Keep::default(),
-        }
-    }
-}
-
-/// The configuration for a size and executor, if there is one.
-fn config_for(folder: &Path, agents: usize, executor: ExecutorKind) -> Option<PathBuf> {
-    [format!("simple-spread-{agents}-{executor}.toml"), format!("simple-spread-{agents}.toml")]
-        .map(|name| folder.join(name))
-        .into_iter()
-        .find(|path| path.is_file())
-}
-
-pub(super) fn train(args: &TrainArgs) -> anyhow::Result<Report> {
-    let place = args.keep.place()?;
-    let title = format!(
-        "Training, then {} unseen episodes per seed; seeds {:?}; {}",
-        args.episodes,
-        args.seeds,
-        if args.in_process { "one process" } else { "services and two actor processes" }
-    );
-    let heading = [
-        "executor", "N", "joint steps", "to target", "success", "all covered", "sampled", "arrival", "scripted", "collisions",
-        "cost",
-    ];
-    let mut report = Report::new("train", title, 1, &heading);
-    for &agents in &args.agents {
-        for &executor in &args.executors {
-            let (mut runs, mut evals, mut yardsticks) = (Vec::new(), Vec::new(), Vec::new());
-            for &seed in &args.seeds {
-                let out = place.path.join(format!("{agents}-{executor}-s{seed}")).display().to_string();
-                let seed = seed.to_string();
-                let mut line = strings(&["train", "--out", &out, "--seed", &seed, "--agents", &agents.to_string()]);
-                line.extend(strings(&["--executor", &executor.to_string()]));
-                line.extend(config_for(&args.configs, agents, executor).map(|path| path.display().to_string()));
-                line.extend(args.max_steps.into_iter().flat_map(|steps| strings(&["--max-steps", &steps.to_string()])));
-                line.extend(args.whole_budget.then(|| strings(&["--target-success", "2"])).into_iter().flatten());
-                line.extend(args.in_process.then(|| "--in-process".to_owned()));
-                let run = magex(&line)?;
-                let count = args.episodes.to_string();
-                let eval = magex(&strings(&["eval", &out, "--episodes", &count]))?;
-                yardsticks.push(magex(&strings(&["eval", &out, "--episodes", &count, "--controller", "scripted", "--scheduler", "exact"]))?);
-                note(format!(
-                    "N = {agents}, {executor}, seed {seed}: {} steps, {}, success {}",
-                    thousands(number(&run, "joint_env_steps")),
-                    seconds(number(&run, "target_wall_s")),
-                    share(number(&eval["mean"]["greedy"], "success_rate"))
-                ));
-                runs.push(run);
-                evals.push(eval);
-            }
-            let mean = |all: &[Value], get: &dyn Fn(&Value) -> f64| all.iter().map(get).sum::<f64>() / all.len().max(1) as f64;
-            let worst = |all: &[Value], get: &dyn Fn(&Value) -> f64| all.iter().map(get).fold(f64::NEG_INFINITY, f64::max);
-            let greedy = |key: &'static str| mean(&evals, &move |e| number(&e["mean"]["greedy"], key));
-            let sampled = mean(&evals, &|e| number(&e["mean"]["sampled"], "success_rate"));
-            let scripted = mean(&yardsticks, &|e| number(&e["mean"]["greedy"], "arrival_step"));
-            let (steps, wall) =
-                (worst(&runs, &|r| number(r, "joint_env_steps")), worst(&runs, &|r| number(r, "target_wall_s")));
-            let reached = runs.iter().all(|run| run["target_reached"] == true);
-            let cells = vec![
-                executor.to_string(),
-                agents.to_string(),
-                thousands(steps),
-                if reached { seconds(wall) } else { format!("({})", seconds(wall)) },
-                share(greedy("success_rate")),
-                share(greedy("all_covered_rate")),
-                share(sampled),
-                format!("{:.1}", greedy("arrival_step")),
-                format!("{scripted:.1}"),
-                format!("{:.4}", greedy("collisions_per_agent_step")),
-                format!("{:.4}", greedy("cost_ratio")),
-            ];
-            let value = json!({ "agents": agents, "executor": executor, "runs": runs, "evaluations": evals, "scripted": yardsticks });
-            report.row(cells, value);
-        }
-    }
-    report.notes.push(
-        "joint steps and time to target are the worst seed's, the rest are means; a time in brackets did not reach the target. \
-         scripted: arrival step of the scripted controller with exact goals."
-            .into(),
-    );
+    report
+        .notes
+        .push("ratio: training alone. command ratio: from the command to its end, closing evaluation included.".into());
     Ok(report)
 }
 
@@ -309,7 +186,8 @@ pub(super) struct GeneralisationArgs {
 }
 
 pub(super) fn generalisation(args: &GeneralisationArgs) -> anyhow::Result<Report> {
-    let title = format!("Other team sizes without training: same density, exact scheduler, greedy, {} starts", args.spawn);
+    let title =
+        format!("Other team sizes without training: same density, exact scheduler, greedy, {} starts", args.spawn);
     let heading = ["run", "N", "episodes", "success", "matched", "all covered", "arrival", "collisions"];
     let mut report = Report::new("generalisation", title, 1, &heading);
     for run in &args.runs {
@@ -318,7 +196,18 @@ pub(super) fn generalisation(args: &GeneralisationArgs) -> anyhow::Result<Report
             let episodes = if agents >= 1000 { args.episodes.div_ceil(10) } else { args.episodes };
             let (path, count, size) = (run.display().to_string(), episodes.to_string(), agents.to_string());
             let eval = magex(&strings(&[
-                "eval", &path, "--agents", &size, "--episodes", &count, "--scheduler", "exact", "--mode", "greedy", "--spawn", &args.spawn,
+                "eval",
+                &path,
+                "--agents",
+                &size,
+                "--episodes",
+                &count,
+                "--scheduler",
+                "exact",
+                "--mode",
+                "greedy",
+                "--spawn",
+                &args.spawn,
             ]))?;
             let mean = &eval["mean"]["greedy"];
             let cells = vec![
