@@ -262,15 +262,35 @@ fn recordings_are_verified() {
     place.fails("verify broken.json", 1, &[]);
 }
 
+/// A commander of this executable.
+struct Commander {
+    child: std::process::Child,
+    url: String,
+}
+
+impl Commander {
+    fn start(place: &Place, arguments: &str) -> Self {
+        let mut command = place.command(&format!("commander --listen 127.0.0.1:0 {arguments}"));
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let ready: Value = serde_json::from_str(&line).unwrap();
+        Self { child, url: format!("http://{}", ready["address"].as_str().unwrap()) }
+    }
+}
+
+impl Drop for Commander {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
 #[test]
 fn a_commander_answers_the_command_line() {
     let place = Place::new();
-    let mut commander =
-        place.command("commander --listen 127.0.0.1:0").stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
-    let mut line = String::new();
-    BufReader::new(commander.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let ready: Value = serde_json::from_str(&line).unwrap();
-    let url = format!("http://{}", ready["address"].as_str().unwrap());
+    let commander = Commander::start(&place, "");
+    let url = &commander.url;
     let answer =
         place.json(&format!("assign --connect {url} --agents [[0,0],[1,0]] --goals [[1,1],[0,1]] --scheduler exact"));
     assert_eq!(answer["pairs"][0]["goal"], 1);
@@ -281,6 +301,11 @@ fn a_commander_answers_the_command_line() {
     let table = place.run(&format!("assign --connect {url} --random 4 --scheduler exact"));
     assert!(text(&table.stdout).contains("answered by exact"));
     place.fails(&format!("assign --connect {url} --agents [[0,0]] --goals [[0,0,0]]"), 64, &["dimensions"]);
-    commander.kill().unwrap();
-    commander.wait().unwrap();
+
+    let run = place.trained("run");
+    let trained = Commander::start(&place, "--model run");
+    let answer = place.json(&format!("assign --connect {} --random 12 --seed 1", trained.url));
+    assert_eq!((&answer["scheduler"], &answer["weights_sha256"]), (&"learned".into(), &run["weights_sha256"]));
+    assert!(answer["pairs"][3]["probability"].is_number());
+    place.fails("commander --model nowhere", 64, &["nowhere"]);
 }

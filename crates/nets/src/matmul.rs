@@ -145,10 +145,13 @@ fn tile<const R: usize, const Q: usize>(
     start: usize,
 ) {
     let mut acc = [*init; R];
-    let x = &x[..R * k];
-    for (i, w) in panel.chunks_exact(Q).enumerate().take(k) {
-        for (r, acc) in acc.iter_mut().enumerate() {
-            let a = f32x16::splat(x[r * k + i]);
+    // Slices of exactly k, so that the loop below needs no bounds checks.
+    let rows: [&[f32]; R] = std::array::from_fn(|r| &x[r * k..][..k]);
+    let panel = &panel[..k * Q];
+    for i in 0..k {
+        let w = &panel[i * Q..][..Q];
+        for (row, acc) in rows.iter().zip(&mut acc) {
+            let a = f32x16::splat(row[i]);
             for v in 0..Q {
                 acc[v] = a.mul_add(w[v], acc[v]);
             }

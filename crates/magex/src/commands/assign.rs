@@ -21,10 +21,12 @@ Examples:
   generate-team | magex assign --connect http://127.0.0.1:7100 --agents - --json
   magex assign --connect http://127.0.0.1:7100 --random 50 --seed 7
 
-A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}; two or three coordinates. With more agents than goals some agents
-get none, and the other way round. gap: how much the summed distance exceeds the least possible.
+A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}; two or three coordinates. With more agents
+than goals some agents get none, and the other way round. gap: how much the summed distance exceeds the
+least possible.
 
-Exit codes: 0 done, 1 the commander refused or failed, 64 wrong usage or positions, 69 the commander cannot be reached";
+Exit codes: 0 done, 1 the commander refused or failed, 64 wrong usage or positions,
+69 the commander cannot be reached";
 
 /// Ask a running commander who goes where.
 #[derive(Debug, Clone, clap::Args)]

@@ -18,8 +18,9 @@ Examples:
   magex bench train --agents 50 --seeds 1,2,3       trains and evaluates; the result table
   magex bench distributed                           services against one process
 
-Timings are medians on one core (unless a table says otherwise) and as noisy as the machine is busy: compare ratios taken
-in one go, not numbers from different days. What is not a time is the same on every machine.
+Timings are medians on one core (unless a table says otherwise) and as noisy as the machine is busy:
+compare ratios taken in one go, not numbers from different days. What is not a time is the same on every
+machine.
 
 Exit codes: 0 done, 1 something failed, 64 wrong usage or configuration";
 

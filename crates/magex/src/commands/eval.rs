@@ -25,9 +25,10 @@ Examples:
   magex eval RUN --spawn lines --per-layout                        one row per layout
   magex eval weights.safetensors --config config.toml --json       weights from elsewhere
 
-success: share of landmarks with an agent within 0.15 at the end. matched: the same, one agent per landmark.
-all covered: share of episodes with every landmark covered. arrival: first step with 99 % covered.
-collisions: other agents in contact, per agent and step. cost: summed distance of the goals over the least possible.
+success: share of landmarks with an agent within 0.15 at the end. matched: the same, one agent per
+landmark. all covered: share of episodes with every landmark covered. arrival: first step with 99 %
+covered. collisions: other agents in contact, per agent and step. cost: summed distance of the goals over
+the least possible.
 
 Exit codes: 0 done, 1 evaluation failed, 64 wrong usage or configuration";
 

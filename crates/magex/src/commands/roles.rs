@@ -1,10 +1,12 @@
 //! `magex learner`, `magex actor`, `magex commander`: the services from the one executable, each on its own.
 
+use crate::folder;
 use magex_actor::cli::ActorArgs;
 use magex_commander::cli::CommanderArgs;
 use magex_learner::cli::LearnerArgs;
 use magex_runtime::exit::{self, Failure};
 use std::io::Read as _;
+use std::path::PathBuf;
 use std::time::Duration;
 
 const LEARNER_HELP: &str = "\
@@ -12,29 +14,33 @@ Examples:
   magex learner --config run.toml --out runs/mine --listen 0.0.0.0:7000
   magex learner --out runs/mine --resume
 
-Options can be set in the environment too; options of the command win. Actors and commander may start before or after it.
+Options can be set in the environment too; options of the command win. Actors and commander may start
+before or after it.
 
-Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or configuration, 69 the port is in use,
-73 --out exists or cannot be written, 75 stopped before the end (--resume continues), 130 interrupted twice";
+Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or configuration, 69 the port is in
+use, 73 --out exists or cannot be written, 75 stopped before the end (--resume continues),
+130 interrupted twice";
 
 const ACTOR_HELP: &str = "\
 Examples:
   magex actor --learner http://10.0.0.1:7000 --commander http://10.0.0.2:7100
   magex actor --threads 4 --stay
 
-An actor that finds no learner waits for one. How many actors there are does not change a number of the run.
+An actor that finds no learner waits for one. How many actors there are changes no number of the run.
 
-Exit codes: 0 the run is complete or the actor was told to stop, 64 wrong usage, 69 the learner refused, 130 interrupted twice";
+Exit codes: 0 the run is complete or the actor was told to stop, 64 wrong usage, 69 the learner refused,
+130 interrupted twice";
 
 const COMMANDER_HELP: &str = "\
 Examples:
-  magex commander --learner http://127.0.0.1:7000                               follows a run
-  magex commander --weights RUN/weights.safetensors --config RUN/config.toml    serves a finished run
-  magex commander                                                               exact, greedy and random only
+  magex commander --learner http://127.0.0.1:7000     follows a run
+  magex commander --model runs/mine                   serves a finished run
+  magex commander                                     exact, greedy and random only
 
 Ask it with magex assign, or over gRPC (reflection is on).
 
-Exit codes: 0 told to stop, 64 wrong usage or weights, 69 the port is in use, 70 a fault of this program, 130 interrupted twice";
+Exit codes: 0 told to stop, 64 wrong usage or weights, 69 the port is in use, 70 a fault of this program,
+130 interrupted twice";
 
 /// Run the learner alone: leases work to actors, trains, broadcasts weights.
 #[derive(Debug, Clone, clap::Args)]
@@ -60,6 +66,9 @@ pub(crate) struct ActorRole {
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = COMMANDER_HELP)]
 pub(crate) struct CommanderRole {
+    /// Run folder to serve: its weights and its configuration.
+    #[arg(long, value_name = "RUN", conflicts_with = "weights")]
+    model: Option<PathBuf>,
     #[command(flatten)]
     args: CommanderArgs,
     #[command(flatten)]
@@ -92,7 +101,12 @@ pub(crate) fn actor(role: &ActorRole) -> anyhow::Result<u8> {
 
 pub(crate) fn commander(role: &CommanderRole) -> anyhow::Result<u8> {
     role.leash.tie()?;
-    Ok(magex_commander::cli::run(role.args.clone())?)
+    let mut args = role.args.clone();
+    if let Some(run) = &role.model {
+        folder::config_of(run)?;
+        (args.weights, args.config) = (Some(run.join(folder::WEIGHTS)), Some(run.join(folder::CONFIG)));
+    }
+    Ok(magex_commander::cli::run(args)?)
 }
 
 impl Leash {

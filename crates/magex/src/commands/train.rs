@@ -30,12 +30,13 @@ Examples:
   magex train --resume --out runs/mine          continue after Ctrl-C or a crash
   magex train --in-process --json               no other processes; result as JSON
 
-The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, curve.svg and
-replay.html. The same configuration and seed give the same weights, in one process or with any number of actors.
-Ctrl-C finishes the iteration, writes a checkpoint and says how to resume; a second Ctrl-C stops at once.
+The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, curve.svg
+and replay.html. The same configuration and seed give the same weights, in one process or with any number
+of actors. Ctrl-C finishes the iteration, writes a checkpoint and says how to resume; a second Ctrl-C
+stops at once.
 
-Exit codes: 0 done, 1 training failed, 64 wrong usage or configuration, 73 --out exists or cannot be written,
-75 stopped before the end (--resume continues), 130 interrupted twice";
+Exit codes: 0 done, 1 training failed, 64 wrong usage or configuration, 73 --out exists or cannot be
+written, 75 stopped before the end (--resume continues), 130 interrupted twice";
 
 /// Train a team, and leave a run folder.
 #[derive(Debug, Clone, clap::Args)]

@@ -13,8 +13,9 @@ Examples:
   magex verify recordings/mpe-n50.json       one file
   magex verify DIR --json
 
-Recordings of the original simulator (format mpe-golden-1) are replayed step by step; recordings of assignment problems are
-solved. The worst difference per file is printed beside the largest one that passes. Other JSON files are skipped.
+Recordings of the original simulator (format mpe-golden-1) are replayed step by step; recordings of
+assignment problems are solved. The worst difference per file is printed beside the largest one that
+passes. Other JSON files are skipped.
 
 Exit codes: 0 everything agrees, 1 something does not or nothing could be checked, 64 no such folder";
 

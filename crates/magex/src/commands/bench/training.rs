@@ -11,7 +11,10 @@ use std::path::{Path, PathBuf};
 /// Options of `bench train`.
 #[derive(Debug, Clone, clap::Args)]
 pub(super) struct TrainArgs {
-    /// Folder with <task>-<N>-<executor>.toml or <task>-<N>.toml; what is not there takes the defaults.
+    /// Configuration of every run; team size, executor and seed are set all the same.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Folder with spread-<N>-<executor>.toml or spread-<N>.toml; what is not there takes the defaults.
     #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
     configs: PathBuf,
     /// Team sizes.
@@ -42,6 +45,7 @@ pub(super) struct TrainArgs {
 impl Default for TrainArgs {
     fn default() -> Self {
         Self {
+            config: None,
             configs: "deploy/configs".into(),
             agents: vec![50, 20, 5],
             executors: vec![ExecutorKind::Magex, ExecutorKind::Local],
@@ -57,7 +61,7 @@ impl Default for TrainArgs {
 
 /// The configuration for a size and executor, if there is one.
 fn config_for(folder: &Path, agents: usize, executor: ExecutorKind) -> Option<PathBuf> {
-    [format!("simple-spread-{agents}-{executor}.toml"), format!("simple-spread-{agents}.toml")]
+    [format!("spread-{agents}-{executor}.toml"), format!("spread-{agents}.toml")]
         .map(|name| folder.join(name))
         .into_iter()
         .find(|path| path.is_file())
@@ -93,7 +97,8 @@ pub(super) fn train(args: &TrainArgs) -> anyhow::Result<Report> {
                 let seed = seed.to_string();
                 let mut line = strings(&["train", "--out", &out, "--seed", &seed, "--agents", &agents.to_string()]);
                 line.extend(strings(&["--executor", &executor.to_string()]));
-                line.extend(config_for(&args.configs, agents, executor).map(|path| path.display().to_string()));
+                let config = args.config.clone().or_else(|| config_for(&args.configs, agents, executor));
+                line.extend(config.map(|path| path.display().to_string()));
                 line.extend(args.max_steps.into_iter().flat_map(|steps| strings(&["--max-steps", &steps.to_string()])));
                 line.extend(args.whole_budget.then(|| strings(&["--target-success", "2"])).into_iter().flatten());
                 line.extend(args.in_process.then(|| "--in-process".to_owned()));
@@ -147,7 +152,7 @@ pub(super) fn train(args: &TrainArgs) -> anyhow::Result<Report> {
         }
     }
     report.notes.push(
-        "joint steps and time to target are the worst seed's, the rest are means; a time in brackets did not reach the target. \
+        "joint steps and time to target are the worst seed's, the rest are means. \
          scripted: arrival step of the scripted controller with exact goals."
             .into(),
     );
