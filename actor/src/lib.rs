@@ -1,11 +1,11 @@
 //! magex-actor
-pub mod rollout;
 pub mod cache;
+pub mod cli;
 mod crew;
 pub mod goals;
 mod link;
+pub mod policy;
+pub mod rollout;
 pub mod run;
 mod weights_feed;
 pub mod worker;
-pub mod cli;
-pub mod policy;

@@ -242,17 +242,14 @@ impl Policy {
             Driver::Policy(network) => network.memory(),
             Driver::Scripted => 0,
         };
-        let noise =
-            (shard.mode == Mode::Sampled).then(|| graph.iter().map(|key| key.stream().bits64()).collect());
+        let noise = (shard.mode == Mode::Sampled).then(|| graph.iter().map(|key| key.stream().bits64()).collect());
         Self { hidden: vec![0.0; episodes * agents * memory], noise, episodes, agents }
     }
 
     /// [B·N, A] logits of one joint step; the memory moves on.
     fn logits(&mut self, network: &dyn Network, features: &Features, step: usize) -> candle_core::Result<Vec<f32>> {
         let noise = match &self.noise {
-            Some(bases) => {
-                GraphNoise::Keyed(Arc::new(bases.iter().map(|&base| sequence(base, step as u32)).collect()))
-            }
+            Some(bases) => GraphNoise::Keyed(Arc::new(bases.iter().map(|&base| sequence(base, step as u32)).collect())),
             None => GraphNoise::Off,
         };
         let output = network.forward(&Input {

@@ -1,10 +1,10 @@
 //! magex-commander
-pub mod learned;
 mod assign;
 mod classical;
+pub mod cli;
+pub mod learned;
 pub mod scheduler;
 pub mod service;
 mod store;
 mod subscription;
-pub mod cli;
 pub mod trained;

@@ -19,7 +19,7 @@ pub struct Batch {
     pub log_probs: Vec<f32>,
     /// [E, T, N]
     pub rewards: Vec<f32>,
-    /// [E] bases of the keys of the graph's noise; step t of episode e uses `sequence(base, t)`.
+    /// `[E]` bases of the keys of the graph's noise; step t of episode e uses `sequence(base, t)`.
     pub noise: Vec<u64>,
 }
 
@@ -102,7 +102,8 @@ fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
     }
     let landmarks = &t.landmarks[b * s.landmarks * d..(b + 1) * s.landmarks * d];
     let goals = &t.goals[b * n * k..(b + 1) * n * k];
-    let once: Vec<f32> = goals.iter().flat_map(|&g| &landmarks[g as usize * d..(g as usize + 1) * d]).copied().collect();
+    let once: Vec<f32> =
+        goals.iter().flat_map(|&g| &landmarks[g as usize * d..(g as usize + 1) * d]).copied().collect();
     let targets = once.repeat(states);
     spec.compute(&JointStates {
         agents: n,

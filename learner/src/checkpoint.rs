@@ -88,15 +88,13 @@ impl Learned {
 
     /// What actors and commanders need: everything but the critic.
     pub fn broadcast(&self) -> Result<Vec<u8>, ParamError> {
-        to_safetensors(
-            &[("actor", &self.executor.actor), ("commander", &self.commander.params)],
-            "{\"format\":1}",
-        )
+        to_safetensors(&[("actor", &self.executor.actor), ("commander", &self.commander.params)], "{\"format\":1}")
     }
 
     fn moments(&self) -> Result<Vec<u8>, ParamError> {
         let (e, c) = (&self.executor, &self.commander);
-        let with = |params: &Params, numbers: &[f32]| Params { entries: params.entries.clone(), numbers: numbers.to_vec() };
+        let with =
+            |params: &Params, numbers: &[f32]| Params { entries: params.entries.clone(), numbers: numbers.to_vec() };
         let sets = [
             ("actor.first", with(&e.actor, &e.actor_adam.first)),
             ("actor.second", with(&e.actor, &e.actor_adam.second)),
@@ -203,8 +201,7 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
         }
         contents.push(bytes);
     }
-    let progress: Progress =
-        serde_json::from_slice(&contents[2]).map_err(|e| corrupt("state.json", e.to_string()))?;
+    let progress: Progress = serde_json::from_slice(&contents[2]).map_err(|e| corrupt("state.json", e.to_string()))?;
     let mut learned = template.clone();
     from_safetensors(&contents[0], "actor", &mut learned.executor.actor)?;
     from_safetensors(&contents[0], "critic", &mut learned.executor.critic)?;

@@ -99,7 +99,8 @@ impl CommanderPpo {
                 let exact = f64::from(t.exact_costs[b]).max(1e-9);
                 let advantage = (greedy - f64::from(t.costs[b])) / exact;
                 ratio_sum += greedy / exact;
-                let log_probs = commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
+                let log_probs =
+                    commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
                 let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
                 error = error.max(f64::from((total - t.goal_log_probs[b]).abs()) / picks.len().max(1) as f64);
                 samples.push(Sample { instance, picks, advantage: advantage as f32 });
@@ -132,8 +133,7 @@ impl CommanderPpo {
             for minibatch in order.chunks(c.minibatch) {
                 let variables = state.params.variables()?;
                 let tensors = variables.iter().map(|v: &Var| v.as_tensor().clone()).collect();
-                let commander =
-                    Commander::build(c, self.agents, self.dims, &mut state.params.source(tensors))?;
+                let commander = Commander::build(c, self.agents, self.dims, &mut state.params.source(tensors))?;
                 let instances: Vec<Instance> = minibatch.iter().map(|&i| samples[i].instance.clone()).collect();
                 let picks: Vec<Vec<Pick>> = minibatch.iter().map(|&i| samples[i].picks.clone()).collect();
                 let now = commander.pick_log_probs(&instances, &picks)?;

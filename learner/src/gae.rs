@@ -15,7 +15,7 @@ impl Gae {
     /// Advantages and returns of one episode, in raw units:
     /// δ_t = r_t + γ V_{t+1} − V_t, A_t = δ_t + γ λ A_{t+1}, R_t = A_t + V_t.
     ///
-    /// `rewards` [T], `values` [T+1] where the last one is V of the true last state, before any reset. `stride` steps
+    /// `rewards` `[T]`, `values` [T+1] where the last one is V of the true last state, before any reset. `stride` steps
     /// over interleaved agents: element t of this agent is at index t · stride.
     pub fn run(&self, rewards: &[f32], values: &[f32], stride: usize, advantages: &mut [f32], returns: &mut [f32]) {
         let steps = rewards.len().div_ceil(stride);

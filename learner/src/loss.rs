@@ -27,9 +27,9 @@ pub struct PolicyStats {
 pub struct PolicyRows {
     /// [R, H]
     pub actions: Vec<u8>,
-    /// [R] log-probability under the policy that acted.
+    /// `[R]` log-probability under the policy that acted.
     pub old_log_probs: Vec<f32>,
-    /// [R] normalised advantages.
+    /// `[R]` normalised advantages.
     pub advantages: Vec<f32>,
 }
 
@@ -145,9 +145,9 @@ fn gradient(saved: &[f32], input: &Tensor, upstream: &Tensor) -> Result<Option<T
 /// Data of the rows of a minibatch shard.
 #[derive(Debug, Clone)]
 pub struct ValueRows {
-    /// [R] values under the old critic, in normalised units.
+    /// `[R]` values under the old critic, in normalised units.
     pub old_values: Vec<f32>,
-    /// [R] returns in normalised units (with the statistics of this minibatch).
+    /// `[R]` returns in normalised units (with the statistics of this minibatch).
     pub targets: Vec<f32>,
 }
 
@@ -193,7 +193,8 @@ impl CustomOp1 for ValueLoss {
         }
         let mut gradient = vec![0.0; count];
         let mut total = 0.0f64;
-        for (((d, &v), &old), &y) in gradient.iter_mut().zip(values).zip(&self.rows.old_values).zip(&self.rows.targets) {
+        for (((d, &v), &old), &y) in gradient.iter_mut().zip(values).zip(&self.rows.old_values).zip(&self.rows.targets)
+        {
             let moved = v - old;
             let (plain, d_plain) = self.huber(y - v);
             let (clipped, d_clipped) = self.huber(y - (old + moved.clamp(-self.clip, self.clip)));
@@ -251,11 +252,7 @@ mod tests {
     fn policy_loss_matches_a_hand_computed_value() {
         // Equal logits: π = 1/2; old log-probability ln(1/3): ρ = 1.5, A = 2 → min(3, 1.2·2) = 2.4.
         let heads = ActionHeads::new(vec![2]).unwrap();
-        let rows = PolicyRows {
-            actions: vec![1],
-            old_log_probs: vec![(1.0f32 / 3.0).ln()],
-            advantages: vec![2.0],
-        };
+        let rows = PolicyRows { actions: vec![1], old_log_probs: vec![(1.0f32 / 3.0).ln()], advantages: vec![2.0] };
         let x = Tensor::zeros((1, 2), candle_core::DType::F32, &Device::Cpu).unwrap();
         let (loss, stats) = policy_loss(&x, rows, &heads, 0.2, 0.0, 1.0).unwrap();
         assert!((loss.to_scalar::<f32>().unwrap() + 2.4).abs() < 1e-5);

@@ -192,8 +192,10 @@ impl Mappo {
 
                 // 5. Gradients of both networks, shard by shard.
                 let shards = m.grad_shards.min(units.len());
-                let jobs: Vec<(Role, usize)> =
-                    [Role::Actor, Role::Critic].into_iter().flat_map(|role| (0..shards).map(move |s| (role, s))).collect();
+                let jobs: Vec<(Role, usize)> = [Role::Actor, Role::Critic]
+                    .into_iter()
+                    .flat_map(|role| (0..shards).map(move |s| (role, s)))
+                    .collect();
                 let results: Vec<(Vec<f32>, PolicyStats, f64)> = jobs
                     .into_par_iter()
                     .map(|(role, shard)| {

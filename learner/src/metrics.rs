@@ -251,8 +251,9 @@ impl MetricsFile {
         let kept: String = text
             .lines()
             .filter(|line| {
-                serde_json::from_str::<serde_json::Value>(line)
-                    .is_ok_and(|v| v["iteration"].as_u64().is_some_and(|i| i <= iteration.into()) && !v["executor"].is_null())
+                serde_json::from_str::<serde_json::Value>(line).is_ok_and(|v| {
+                    v["iteration"].as_u64().is_some_and(|i| i <= iteration.into()) && !v["executor"].is_null()
+                })
             })
             .flat_map(|line| [line, "\n"])
             .collect();

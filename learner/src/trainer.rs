@@ -111,8 +111,7 @@ impl Trainer {
 
     fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mappo = Mappo::new(config)?;
-        let commander =
-            CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed);
+        let commander = CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed);
         let learned = Learned { executor: mappo.start()?, commander: commander.start()? };
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
         let pool = rayon::ThreadPoolBuilder::new()
@@ -213,8 +212,10 @@ impl Trainer {
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
             if due || stop.is_some() || collector.checkpoint_requested() {
                 let path = self.checkpoint()?;
-                let event =
-                    RunEvent::Checkpoint { iteration: Iteration(self.progress.iteration), path: path.display().to_string() };
+                let event = RunEvent::Checkpoint {
+                    iteration: Iteration(self.progress.iteration),
+                    path: path.display().to_string(),
+                };
                 collector.event(event);
             }
             timing.checkpoint_s = clock.elapsed().as_secs_f64();
@@ -250,13 +251,7 @@ impl Trainer {
     }
 
     /// Shards of an evaluation of the present version.
-    fn evaluation(
-        &self,
-        set: u32,
-        episodes: u32,
-        mode: Mode,
-        record: bool,
-    ) -> impl Iterator<Item = Shard> + use<> {
+    fn evaluation(&self, set: u32, episodes: u32, mode: Mode, record: bool) -> impl Iterator<Item = Shard> + use<> {
         let iteration = self.progress.iteration;
         // The two final evaluations share spawns; their shards need different names.
         let offset = if mode == Mode::Sampled { episodes.div_ceil(EVAL_SHARD) } else { 0 };
@@ -283,8 +278,15 @@ impl Trainer {
         updates: Option<(crate::mappo::UpdateStats, crate::commander::CommanderStats)>,
     ) -> Result<(), TrainError> {
         let wall_s = self.progress.wall_s + self.started.elapsed().as_secs_f64();
-        let metrics =
-            IterationMetrics::new(&self.config, &self.progress, summarise(episodes), evaluation, timing, updates, wall_s);
+        let metrics = IterationMetrics::new(
+            &self.config,
+            &self.progress,
+            summarise(episodes),
+            evaluation,
+            timing,
+            updates,
+            wall_s,
+        );
         let line = self.metrics.append(&metrics)?;
         collector.event(RunEvent::Iteration(IterationReport {
             iteration: Iteration(metrics.iteration),

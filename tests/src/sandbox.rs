@@ -138,8 +138,17 @@ impl Cluster {
         let run = folder.path().join("run");
         let mut learner = Process::start(
             &[
-                "learner", "--config", &text(&file), "--out", &text(&run), "--listen", "127.0.0.1:0", "--threads", "1",
-                "--lease-seconds", LEASE,
+                "learner",
+                "--config",
+                &text(&file),
+                "--out",
+                &text(&run),
+                "--listen",
+                "127.0.0.1:0",
+                "--threads",
+                "1",
+                "--lease-seconds",
+                LEASE,
             ],
             &folder.path().join("learner.log"),
         );
@@ -190,8 +199,16 @@ impl Cluster {
         let run = self.run();
         let mut learner = Process::start(
             &[
-                "learner", "--resume", "--out", &text(&run), "--listen", &self.learner_address, "--threads", "1",
-                "--lease-seconds", LEASE,
+                "learner",
+                "--resume",
+                "--out",
+                &text(&run),
+                "--listen",
+                &self.learner_address,
+                "--threads",
+                "1",
+                "--lease-seconds",
+                LEASE,
             ],
             &self.folder.path().join("learner.log"),
         );

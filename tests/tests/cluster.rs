@@ -1,5 +1,5 @@
 //! Real processes, real signals: whatever dies, the weights are the same bits as those of an undisturbed run in one process.
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::task::Spawn;

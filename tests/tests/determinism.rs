@@ -1,6 +1,6 @@
 //! The same configuration and seed give the same bits, however the work is spread; within one process. The same across
 //! processes is in `cluster.rs`.
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
 use magex_learner::checkpoint;
@@ -9,13 +9,8 @@ use magex_tests::{drive, small, train, updates};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-const KINDS: [ExecutorKind; 5] = [
-    ExecutorKind::Magex,
-    ExecutorKind::MagexLiteral,
-    ExecutorKind::Attention,
-    ExecutorKind::Mlp,
-    ExecutorKind::Local,
-];
+const KINDS: [ExecutorKind; 5] =
+    [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Attention, ExecutorKind::Mlp, ExecutorKind::Local];
 
 fn hash(config: &RunConfig, actors: usize, threads: usize) -> String {
     train(config, tempfile::tempdir().unwrap().path(), actors, threads).sha256

@@ -1,5 +1,5 @@
 //! Rules of the repository that a compiler does not check.
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -131,7 +131,9 @@ fn every_configuration_key_and_dependency_is_documented() {
     }
     let dependencies = std::fs::read_to_string(root().join("docs/dependencies.md")).unwrap();
     let manifest = std::fs::read_to_string(root().join("Cargo.toml")).unwrap();
-    for line in manifest.split("[workspace.dependencies]").nth(1).unwrap().split("[workspace.lints").next().unwrap().lines() {
+    for line in
+        manifest.split("[workspace.dependencies]").nth(1).unwrap().split("[workspace.lints").next().unwrap().lines()
+    {
         if let Some((name, _)) = line.split_once(" = ")
             && !name.starts_with("magex")
             && !name.starts_with('#')

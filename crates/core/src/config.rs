@@ -450,8 +450,7 @@ mod tests {
 
     #[test]
     fn a_partial_task_takes_the_paper_sizes() {
-        let config =
-            RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'").unwrap();
+        let config = RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'").unwrap();
         assert_eq!((config.task.side, config.task.horizon), (2.0, 60));
     }
 }

@@ -26,7 +26,9 @@ pub enum Spawn {
 impl TryFrom<String> for Spawn {
     type Error = String;
     fn try_from(text: String) -> Result<Self, String> {
-        let unknown = || format!("task.spawn: unknown spawn mode '{text}'; use uniform, lines, lines-0..3, authors or authors-0..3");
+        let unknown = || {
+            format!("task.spawn: unknown spawn mode '{text}'; use uniform, lines, lines-0..3, authors or authors-0..3")
+        };
         let layout = |suffix: &str| match suffix {
             "" => Ok(None),
             "-0" => Ok(Some(0)),

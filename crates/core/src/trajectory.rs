@@ -46,13 +46,13 @@ pub struct Trajectory {
     pub log_probs: Vec<f32>,
     /// [T, B, N]
     pub rewards: Vec<f32>,
-    /// [B] log-probability of the commander's assignment.
+    /// `[B]` log-probability of the commander's assignment.
     pub goal_log_probs: Vec<f32>,
-    /// [B] C_c: summed distance of the commander's assignment.
+    /// `[B]` C_c: summed distance of the commander's assignment.
     pub costs: Vec<f32>,
-    /// [B] C_h: summed distance of the exact assignment.
+    /// `[B]` C_h: summed distance of the exact assignment.
     pub exact_costs: Vec<f32>,
-    /// [B] metrics of each episode.
+    /// `[B]` metrics of each episode.
     pub metrics: Vec<EpisodeMetrics>,
 }
 
@@ -145,14 +145,22 @@ impl Trajectory {
             return Err(format!("trajectory.log_probs[{place}]: {} is above 0", self.log_probs[place]));
         }
         if self.goals.len() != b * n * s.targets {
-            return Err(format!("trajectory.goals: {} entries, the shape asks for {}", self.goals.len(), b * n * s.targets));
+            return Err(format!(
+                "trajectory.goals: {} entries, the shape asks for {}",
+                self.goals.len(),
+                b * n * s.targets
+            ));
         }
         let bound = s.landmarks.max(s.bodies) as u32;
         if let Some(place) = self.goals.iter().position(|&g| g >= bound) {
             return Err(format!("trajectory.goals[{place}]: {} is not below {bound}", self.goals[place]));
         }
         if self.actions.len() != t * b * n * s.heads {
-            return Err(format!("trajectory.actions: {} entries, the shape asks for {}", self.actions.len(), t * b * n * s.heads));
+            return Err(format!(
+                "trajectory.actions: {} entries, the shape asks for {}",
+                self.actions.len(),
+                t * b * n * s.heads
+            ));
         }
         if self.metrics.len() != b {
             return Err(format!("trajectory.metrics: {} entries, the shape asks for {b}", self.metrics.len()));

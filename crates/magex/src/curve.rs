@@ -60,8 +60,13 @@ pub fn parse_metrics(text: &str) -> Result<Vec<MetricsPoint>, CurveError> {
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let mut points: Vec<MetricsPoint> = Vec::new();
     for (index, line) in whole.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
-        let point: MetricsPoint = serde_json::from_str(line)
+        let mut point: MetricsPoint = serde_json::from_str(line)
             .map_err(|error| CurveError::Line { line: index + 1, reason: error.to_string() })?;
+        // The last line of a run only evaluates, under the number of the iteration before it.
+        if let Some(last) = points.last().filter(|last| last.iteration == point.iteration) {
+            point.sampled_success_rate = point.sampled_success_rate.or(last.sampled_success_rate);
+            point.reward = point.reward.or(last.reward);
+        }
         while points.last().is_some_and(|last| last.iteration >= point.iteration) {
             points.pop();
         }
@@ -304,6 +309,18 @@ mod tests {
         assert!(error.starts_with("metrics.jsonl line 2"), "{error}");
         let error = parse_metrics("{\"iteration\":3}\n").unwrap_err().to_string();
         assert!(error.contains("joint_env_steps"), "{error}");
+    }
+
+    #[test]
+    fn the_closing_evaluation_keeps_what_its_iteration_trained() {
+        let line = |success: &str, sampled: &str| {
+            format!(
+                "{{\"iteration\":4,\"joint_env_steps\":9,\"success_rate\":{success},\"sampled_success_rate\":{sampled}}}\n"
+            )
+        };
+        let points = parse_metrics(&(line("0.5", "0.25") + &line("0.75", "null"))).unwrap();
+        assert_eq!(points.len(), 1);
+        assert_eq!((points[0].success_rate, points[0].sampled_success_rate), (Some(0.75), Some(0.25)));
     }
 
     #[test]

@@ -1,4 +1,5 @@
 //! The command as a user calls it: what it prints, what it leaves, and how it ends.
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use serde_json::Value;
 use std::fs;

@@ -68,11 +68,11 @@ impl Team<'_> {
 /// A decision and its probability.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decision {
-    /// [N] goal of each agent; `u32::MAX` where there are more agents than goals.
+    /// `[N]` goal of each agent; `u32::MAX` where there are more agents than goals.
     pub goals: Vec<u32>,
     /// Log-probability of the whole decision; 0 for schedulers that are not learned.
     pub log_prob: f32,
-    /// [N] probability of each agent's pick when it was made; 1 for schedulers that are not learned.
+    /// `[N]` probability of each agent's pick when it was made; 1 for schedulers that are not learned.
     pub probabilities: Vec<f32>,
 }
 
@@ -243,7 +243,7 @@ impl Instance {
         (decision, picks)
     }
 
-    /// The picks that lead to a given decision ([N] goals), in the order of the turns; `None` if it is not one-to-one.
+    /// The picks that lead to a given decision (`[N]` goals), in the order of the turns; `None` if it is not one-to-one.
     pub fn picks_of(&self, goals: &[u32]) -> Option<Vec<Pick>> {
         let mut agent_of = std::collections::BTreeMap::new();
         for (agent, goal) in goals.iter().enumerate() {

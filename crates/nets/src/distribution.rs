@@ -51,7 +51,9 @@ impl ActionHeads {
             let log_probs = &mut log_probs[..size];
             log_softmax(&logits[at..at + size], log_probs);
             let pick = match &mut stream {
-                None => log_probs.iter().enumerate().fold(0, |best, (i, &x)| if x > log_probs[best] { i } else { best }),
+                None => {
+                    log_probs.iter().enumerate().fold(0, |best, (i, &x)| if x > log_probs[best] { i } else { best })
+                }
                 Some(stream) => {
                     let u = stream.uniform32();
                     let mut sum = 0.0;

@@ -57,7 +57,7 @@ pub struct Features {
     pub goals: Vec<f32>,
     /// [R, k, 2D + 1] offset, relative velocity, closeness.
     pub neighbours: Vec<f32>,
-    /// [R] how many of the k are real.
+    /// `[R]` how many of the k are real.
     pub counts: Vec<u8>,
 }
 
@@ -141,7 +141,14 @@ impl FeatureSpec {
     }
 
     /// The k nearest agents within reach, nearest first, ties by index.
-    fn neighbour_features(&self, p: &[f32], v: &[f32], near: &mut Vec<(f32, usize)>, out: &mut [f32], counts: &mut [u8]) {
+    fn neighbour_features(
+        &self,
+        p: &[f32],
+        v: &[f32],
+        near: &mut Vec<(f32, usize)>,
+        out: &mut [f32],
+        counts: &mut [u8],
+    ) {
         let (d, k) = (self.dims, self.neighbours);
         let agents = p.len() / d;
         let width = self.neighbour_width();

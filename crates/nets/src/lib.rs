@@ -1,11 +1,11 @@
 //! Networks of MAGE-X on candle: features, layers with hand-written gradients, the action executor and its ablations,
 //! the goal commander, and parameter I/O. No tokio, no clock, no thread.
 
-mod matmul;
 pub mod commander;
 pub mod distribution;
 pub mod executor;
 pub mod features;
+mod matmul;
 pub mod ops;
 pub mod params;
 mod simd;

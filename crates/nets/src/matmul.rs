@@ -88,7 +88,7 @@ impl Packed {
     }
 }
 
-/// y [m, n] = act(x [m, k] · w [k, n] + b [n]).
+/// y [m, n] = act(x [m, k] · w [k, n] + b `[n]`).
 pub(crate) fn matmul(x: &[f32], w: &Packed, bias: Option<&[f32]>, act: Activation, y: &mut [f32]) {
     let n = w.columns;
     let mut start = 0;
@@ -120,7 +120,7 @@ fn panel_rows<const R: usize, const Q: usize>(
             *slot = load(&bias[(start + v * LANES).min(n)..]);
         }
     }
-    let m = if k == 0 { 0 } else { x.len() / k };
+    let m = x.len().checked_div(k).unwrap_or(0);
     let mut row = 0;
     while row + R <= m {
         tile::<R, Q>(&x[row * k..(row + R) * k], panel, k, &init, act, &mut y[row * n..(row + R) * n], n, start);
@@ -166,11 +166,11 @@ fn tile<const R: usize, const Q: usize>(
     }
 }
 
-/// dw [k, n] = xᵀ [k, m] · dz [m, n] and db [n] = Σ rows of dz, both summed over the rows in their order.
+/// dw [k, n] = xᵀ [k, m] · dz [m, n] and db `[n]` = Σ rows of dz, both summed over the rows in their order.
 pub(crate) fn weight_gradient(x: &[f32], dz: &[f32], k: usize, n: usize) -> (Vec<f32>, Vec<f32>) {
     let vectors = n.div_ceil(LANES);
     let width = vectors * LANES;
-    let rows = if n == 0 { 0 } else { dz.len() / n };
+    let rows = dz.len().checked_div(n).unwrap_or(0);
     let mut dw = vec![f32x16::ZERO; k * vectors];
     let mut db = vec![f32x16::ZERO; vectors];
     // A block of rows stays in the first cache levels while all of dw passes over it.

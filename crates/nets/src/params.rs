@@ -66,7 +66,7 @@ pub enum Source<'a> {
     /// Draws new parameters and remembers them.
     New {
         /// Keyed stream of the initial weights.
-        stream: Stream,
+        stream: Box<Stream>,
         /// What has been drawn.
         params: Params,
     },
@@ -84,7 +84,7 @@ pub enum Source<'a> {
 impl Source<'_> {
     /// A source that draws.
     pub fn new(stream: Stream) -> Self {
-        Self::New { stream, params: Params::default() }
+        Self::New { stream: Box::new(stream), params: Params::default() }
     }
 
     /// The next tensor: drawn, or taken and checked against name and shape.

@@ -1,14 +1,15 @@
 //! Hand-written gradients against finite differences and against candle's own automatic differentiation.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
+use magex_nets::Activation;
 use magex_nets::executor::{Input, build, feature_spec, memory};
 use magex_nets::features::JointStates;
 use magex_nets::ops::{self, GraphBlock, GraphNoise};
 use magex_nets::params::{Params, Source};
-use magex_nets::Activation;
 use std::sync::Arc;
 
 fn normal(n: usize, tag: u32) -> Vec<f32> {
@@ -87,7 +88,8 @@ fn naive_graph(f: &Tensor, q: &Tensor, score: &Tensor, n: usize, p: usize, width
     let v = (v + q).unwrap().unsqueeze(0).unwrap().broadcast_as((n, n, p)).unwrap();
     let hidden = (u + v).unwrap().relu().unwrap();
     let w2 = score.narrow(0, 0, p).unwrap();
-    let logits = hidden.broadcast_mul(&w2).unwrap().sum(2).unwrap().broadcast_add(&score.narrow(0, p, 1).unwrap()).unwrap();
+    let logits =
+        hidden.broadcast_mul(&w2).unwrap().sum(2).unwrap().broadcast_add(&score.narrow(0, p, 1).unwrap()).unwrap();
     let soft = candle_nn_sigmoid(&logits);
     let off_diagonal = {
         let mut m = vec![1.0f32; n * n];
@@ -110,8 +112,7 @@ fn graph_block_matches_straight_through_autodiff() {
     for n in [2, 5, 19, 33] {
         let (p, width) = (6, 32);
         let (f, q, score) = (var(&[n, 2 * p + 2 * width], 1), var(&[n, p], 2), var(&[p + 1], 3));
-        let block =
-            GraphBlock { agents: n, pair_hidden: p, width, block: 0, self_path: true, temperature: 1.0 };
+        let block = GraphBlock { agents: n, pair_hidden: p, width, block: 0, self_path: true, temperature: 1.0 };
         let ours = ops::graph_block(&f, &q, &score, block, GraphNoise::Off).unwrap();
         let reference = naive_graph(&f, &q, &score, n, p, width);
         let gap = (&ours - &reference).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -159,9 +160,13 @@ fn drawn(kind: ExecutorKind, agents: usize, outputs: usize) -> (ExecutorConfig, 
 
 #[test]
 fn every_parameter_of_every_executor_receives_a_gradient() {
-    for kind in
-        [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Attention, ExecutorKind::Mlp, ExecutorKind::Local]
-    {
+    for kind in [
+        ExecutorKind::Magex,
+        ExecutorKind::MagexLiteral,
+        ExecutorKind::Attention,
+        ExecutorKind::Mlp,
+        ExecutorKind::Local,
+    ] {
         let (steps, sequences, agents) = (4, 3, 6);
         let (config, task, params) = drawn(kind, agents, 5);
         let spec = feature_spec(&config, &task);
@@ -209,8 +214,7 @@ fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
         let (count, agents) = (7, 9);
         let (config, task, params) = drawn(kind, agents, 5);
         let spec = feature_spec(&config, &task);
-        let net =
-            build(&config, &spec, agents, 5, 1.0, &mut params.source(params.plain().unwrap())).unwrap();
+        let net = build(&config, &spec, agents, 5, 1.0, &mut params.source(params.plain().unwrap())).unwrap();
         let (positions, velocities, targets) = states(count, agents);
         let run = |from: usize, to: usize| {
             let (a, b) = (from * agents * 2, to * agents * 2);

@@ -33,7 +33,7 @@ async fn a_duplicate_is_dropped() {
     let (mut learner, mut puppet, lease, result) = leased(1).await;
     assert_eq!(puppet.deliver(lease, &result).await.verdict(), Verdict::Accepted);
     assert_eq!(puppet.deliver(lease, &result).await.verdict(), Verdict::Duplicate);
-    assert_eq!(learner.finish().await.unwrap(), [result.clone()]);
+    assert_eq!(learner.finish().await.unwrap(), std::slice::from_ref(&result));
     // And after the plan was taken.
     assert_eq!(puppet.deliver(lease, &result).await.verdict(), Verdict::Duplicate);
     let ledger = learner.ledger();

@@ -178,6 +178,9 @@ pub(crate) async fn until(mut holds: impl FnMut() -> bool) {
     .await;
 }
 
+/// Whether a shard fails.
+pub(crate) type Verdict = fn(&Shard) -> Result<(), WorkError>;
+
 /// A worker that knows the answers.
 #[derive(Clone)]
 pub(crate) struct FakeWorker {
@@ -186,7 +189,7 @@ pub(crate) struct FakeWorker {
     pub(crate) ask_goals: bool,
     /// Works only once this is cancelled.
     pub(crate) gate: Option<CancellationToken>,
-    pub(crate) fail: Option<fn(&Shard) -> Result<(), WorkError>>,
+    pub(crate) fail: Option<Verdict>,
 }
 
 impl Default for FakeWorker {

@@ -33,7 +33,7 @@ impl PairwiseNet {
         })
     }
 
-    /// [P] scores from features [P, 6].
+    /// `[P]` scores from features [P, 6].
     pub(super) fn forward(&self, features: Vec<f32>) -> CandleResult<Tensor> {
         let x = constant(features, FEATURES)?;
         let reduced = x.narrow(1, 0, 1)?.flatten_all()?;

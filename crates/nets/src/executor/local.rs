@@ -9,7 +9,7 @@ use candle_core::{Device, Result as CandleResult, Tensor};
 use magex_core::config::ExecutorConfig;
 use std::sync::Arc;
 
-/// own → h; Σ over neighbours of relu(neighbour → h/2); [both] → h → outputs.
+/// own → h; Σ over neighbours of relu(neighbour → h/2); `[both]` → h → outputs.
 pub struct LocalNet {
     own: Layer,
     neighbour: (Tensor, Tensor),

@@ -191,7 +191,10 @@ impl TeamNet {
             Team::Concat { mix } => {
                 let states = x.dim(0)? / n;
                 let team = mix.forward(&x.reshape((states, n * self.width))?)?;
-                team.unsqueeze(1)?.broadcast_as((states, n, self.width))?.contiguous()?.reshape((states * n, self.width))
+                team.unsqueeze(1)?
+                    .broadcast_as((states, n, self.width))?
+                    .contiguous()?
+                    .reshape((states * n, self.width))
             }
         }
     }

@@ -59,7 +59,7 @@ struct Scratch {
     sender: Vec<f32>,
     /// [P, padded] v_j + q_j, transposed so that one vector holds sixteen neighbours.
     receiver: Vec<f32>,
-    /// [padded] logits plus noise of the current row.
+    /// `[padded]` logits plus noise of the current row.
     logits: Vec<f32>,
 }
 
@@ -258,10 +258,28 @@ impl Op {
                 while v < padded {
                     let row = Row { i, v, n, through_mean, inverse_temperature };
                     if v + 4 * LANES <= padded {
-                        self.row_gradient::<4>(row, score, &scratch, &z, &g, &mut d_score, &mut d_sender, &mut d_receiver);
+                        self.row_gradient::<4>(
+                            row,
+                            score,
+                            &scratch,
+                            &z,
+                            &g,
+                            &mut d_score,
+                            &mut d_sender,
+                            &mut d_receiver,
+                        );
                         v += 4 * LANES;
                     } else {
-                        self.row_gradient::<1>(row, score, &scratch, &z, &g, &mut d_score, &mut d_sender, &mut d_receiver);
+                        self.row_gradient::<1>(
+                            row,
+                            score,
+                            &scratch,
+                            &z,
+                            &g,
+                            &mut d_score,
+                            &mut d_sender,
+                            &mut d_receiver,
+                        );
                         v += LANES;
                     }
                 }

@@ -7,7 +7,7 @@ use wide::f32x16;
 
 /// Gated recurrent unit over a sequence, gates in the order reset, update, new (the convention of PyTorch).
 ///
-/// `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `w` [H, 3H], `b` [3H], `h0` [R·H] the state that enters the
+/// `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `w` [H, 3H], `b` `[3H]`, `h0` [R·H] the state that enters the
 /// sequence (constant: the gradient is truncated there). Returns all states [L, R, H].
 pub fn gru(input: &Tensor, w: &Tensor, b: &Tensor, h0: Vec<f32>) -> Result<Tensor> {
     input.contiguous()?.apply_op3(w, b, Gru { h0, saved: OnceLock::new() })
@@ -36,7 +36,11 @@ impl CustomOp3 for Gru {
         let (steps, rows, triple) = lx.shape().dims3()?;
         let hidden = triple / 3;
         if hidden % LANES != 0 || lw.shape().dims() != [hidden, triple] || self.h0.len() != rows * hidden {
-            bail!("gru: input [{steps}, {rows}, {triple}], w {:?}, {} initial states do not fit", lw.dims(), self.h0.len());
+            bail!(
+                "gru: input [{steps}, {rows}, {triple}], w {:?}, {} initial states do not fit",
+                lw.dims(),
+                self.h0.len()
+            );
         }
         let (x, w, b) = (slice(x, lx)?, Packed::new(slice(w, lw)?, hidden, triple), slice(b, lb)?);
         let mut states = vec![0.0; steps * rows * hidden];

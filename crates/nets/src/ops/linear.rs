@@ -2,7 +2,7 @@ use super::{rows, slice, with_numbers};
 use crate::matmul::{Activation, Packed, matmul, weight_gradient};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-/// y [.., n] = act(x [.., k] · w [k, n] + b [n]). With `constant_input` no gradient is computed for x: candle would
+/// y [.., n] = act(x [.., k] · w [k, n] + b `[n]`). With `constant_input` no gradient is computed for x: candle would
 /// otherwise compute one even for observations.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, act: Activation, constant_input: bool) -> Result<Tensor> {
     x.contiguous()?.apply_op3(w, b, Linear { act, constant_input })

@@ -3,7 +3,7 @@ use crate::simd::{LANES, load, store, sum};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use wide::f32x16;
 
-/// Layer normalisation over the last dimension with scale and shift [n]; ε = 1e-5. Unlike candle-nn's it has a gradient.
+/// Layer normalisation over the last dimension with scale and shift `[n]`; ε = 1e-5. Unlike candle-nn's it has a gradient.
 pub fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op3(scale, shift, LayerNorm)
 }

@@ -111,13 +111,9 @@ impl CustomOp2 for NeighbourPool {
     fn bwd(&self, w: &Tensor, b: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (channels, width) = w.dims2()?;
         let dy = dy.contiguous()?;
-        let (dw, db) = with_numbers(w, |w| {
-            with_numbers(b, |b| with_numbers(&dy, |dy| self.gradient(w, b, dy, width)))
-        })???;
-        Ok((
-            Some(Tensor::from_vec(dw, (channels, width), w.device())?),
-            Some(Tensor::from_vec(db, width, w.device())?),
-        ))
+        let (dw, db) =
+            with_numbers(w, |w| with_numbers(b, |b| with_numbers(&dy, |dy| self.gradient(w, b, dy, width))))???;
+        Ok((Some(Tensor::from_vec(dw, (channels, width), w.device())?), Some(Tensor::from_vec(db, width, w.device())?)))
     }
 }
 
@@ -131,7 +127,8 @@ impl NeighbourPool {
             let bias = load(&b[start..end]);
             let (mut gw, mut gb) = (vec![f32x16::ZERO; channels], f32x16::ZERO);
             let stride = self.neighbours * channels;
-            for ((f, &count), dy) in self.features.chunks_exact(stride).zip(self.counts.iter()).zip(dy.chunks_exact(width))
+            for ((f, &count), dy) in
+                self.features.chunks_exact(stride).zip(self.counts.iter()).zip(dy.chunks_exact(width))
             {
                 let dy = load(&dy[start..end]);
                 for f in f.chunks_exact(channels).take(count.into()) {
