@@ -246,7 +246,7 @@ impl Default for CommanderConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MappoConfig {
-    /// Episodes per iteration; 0 means about 400 agents' worth: 64 for N = 5, 20 for N = 20, 8 from N = 50 on.
+    /// Episodes per iteration; 0 means about 200 agents' worth: 40 for N = 5, 12 for N = 20, 4 from N = 50 on.
     pub episodes: u32,
     /// S: shards that an iteration's episodes are cut into; must divide `episodes`.
     pub shards: u32,
@@ -292,7 +292,7 @@ impl Default for MappoConfig {
             gamma: 0.99,
             gae_lambda: 0.95,
             epochs: 5,
-            minibatch: 4096,
+            minibatch: 2048,
             chunk: 10,
             grad_shards: 4,
             clip: 0.2,
@@ -317,7 +317,7 @@ impl Default for RunConfig {
             task: default_task(),
             executor: ExecutorConfig::default(),
             commander: CommanderConfig::default(),
-            mappo: MappoConfig { episodes: 8, ..MappoConfig::default() },
+            mappo: MappoConfig { episodes: 4, ..MappoConfig::default() },
         }
     }
 }
@@ -334,7 +334,7 @@ impl RunConfig {
         self.task = self.task.resolved();
         if self.mappo.episodes == 0 {
             let shards = self.mappo.shards.max(1);
-            let wanted = (400 / self.task.agents.max(1) as u32).clamp(8, 64);
+            let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
             self.mappo.episodes = wanted.next_multiple_of(shards);
         }
         self.validate()?;
