@@ -10,6 +10,9 @@ use magex_env::bench::throughput;
 use magex_learner::bench::minibatch;
 use serde_json::json;
 
+/// Agent samples of the minibatch that is timed.
+const MINIBATCH: usize = 4096;
+
 /// Options of `bench env`.
 #[derive(Debug, Clone, clap::Args)]
 pub(super) struct EnvArgs {
@@ -62,6 +65,7 @@ pub(super) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
     ] {
         let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
         config.executor.kind = kind;
+        config.mappo.minibatch = MINIBATCH;
         let rounds = if kind == ExecutorKind::Local { args.rounds } else { args.rounds.div_ceil(3) };
         let time = minibatch(&config, 8, rounds as usize)?;
         let cells = vec![
