@@ -168,7 +168,7 @@ impl Bench {
             WorkError::Failed { reason: error.to_string(), retryable }
         })?;
         let (runtime, commander) = (self.tools.runtime.clone(), self.tools.commander.clone());
-        let mut goals = GrpcGoals::new(runtime, commander, key, self.cancelled.clone());
+        let mut goals = GrpcGoals::new(runtime, commander, key, self.welcome.lease, self.cancelled.clone());
         let worker = &mut self.worker;
         let result = match catch_unwind(AssertUnwindSafe(|| worker.work(&job.shard, &weights, &mut goals))) {
             Ok(result) => result?,

@@ -21,6 +21,9 @@ pub enum GoalError {
     /// Nobody wants the result any more.
     #[error("no longer wanted")]
     Cancelled,
+    /// The commander did not answer for so long; another attempt may fare better.
+    #[error("the commander did not answer within {} s", .0.as_secs_f64())]
+    Late(Duration),
     /// The commander refused, and would refuse again.
     #[error("the commander refused: {0}")]
     Refused(String),
@@ -35,30 +38,41 @@ pub trait GoalSource {
     fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError>;
 }
 
-/// Asks the commander service, again and again while it is late or away: for as long as the result is wanted.
+/// Asks the commander service, again and again while it is late or away, for as long as its patience lasts: a commander that
+/// never gets the version (the learner went back to an older one) must not keep a rollout thread for ever.
 #[derive(Debug)]
 pub struct GrpcGoals {
     runtime: Handle,
     client: CommanderServiceClient<Channel>,
     weights: WeightsKey,
+    patience: Duration,
     cancelled: CancellationToken,
 }
 
 impl GrpcGoals {
-    /// Asks these weights over this channel, until cancelled.
-    pub fn new(runtime: Handle, channel: Channel, weights: WeightsKey, cancelled: CancellationToken) -> Self {
+    /// Asks these weights over this channel, until cancelled or out of patience.
+    pub fn new(
+        runtime: Handle,
+        channel: Channel,
+        weights: WeightsKey,
+        patience: Duration,
+        cancelled: CancellationToken,
+    ) -> Self {
         let client = CommanderServiceClient::new(channel)
             .max_decoding_message_size(MAX_BATCH_BYTES)
             .max_encoding_message_size(MAX_BATCH_BYTES);
-        Self { runtime, client, weights, cancelled }
+        Self { runtime, client, weights, patience, cancelled }
     }
 }
 
 impl GoalSource for GrpcGoals {
     fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError> {
         let message = request.to_message(&self.weights);
-        let call = ask(&mut self.client, message);
-        let answer = self.runtime.block_on(self.cancelled.run_until_cancelled(call));
+        let (patience, client) = (self.patience, &mut self.client);
+        let answer = self.runtime.block_on(self.cancelled.run_until_cancelled(async {
+            // The timer must be made within the runtime.
+            tokio::time::timeout(patience, ask(client, message)).await.map_err(|_| GoalError::Late(patience))?
+        }));
         let answer = answer.ok_or(GoalError::Cancelled)??;
         GoalReply::from_message(answer, request).map_err(|error| GoalError::Answer(error.to_string()))
     }

@@ -53,7 +53,7 @@ impl WorkError {
     /// Another attempt may succeed.
     pub fn is_retryable(&self) -> bool {
         match self {
-            Self::Goals(error) => matches!(error, GoalError::Cancelled),
+            Self::Goals(error) => matches!(error, GoalError::Cancelled | GoalError::Late(_)),
             Self::Failed { retryable, .. } => *retryable,
         }
     }

@@ -9,6 +9,9 @@ use magex_proto::{arrays, v1};
 /// Agents or goals of one team.
 pub(crate) const MAX_POINTS: usize = 5000;
 
+/// Pairs that the learned scheduler looks at in one request; larger teams are answered exactly, and the answer says so.
+const MAX_LEARNED_PAIRS: usize = 1_000_000;
+
 /// A request that was read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Team {
@@ -77,6 +80,12 @@ fn points(field: &str, positions: Option<v1::Positions>) -> Result<(Vec<f32>, us
 
 /// Asks the learned scheduler; its answer is a matching, or an error says why it is none.
 pub(crate) fn ask_learned(team: &Team, scheduler: &dyn Scheduler) -> Result<TeamReply, AssignError> {
+    let pairs = team.request.agent_count * team.request.goal_count;
+    if pairs > MAX_LEARNED_PAIRS {
+        return Err(AssignError::Unsupported(format!(
+            "{pairs} pairs are more than the learned scheduler's {MAX_LEARNED_PAIRS}"
+        )));
+    }
     let reply = scheduler.assign_team(&team.request)?;
     check(&reply, &team.request).map_err(AssignError::Failed)?;
     Ok(reply)

@@ -31,8 +31,8 @@ impl Adam {
         }
         let scale = if norm > max_norm { max_norm / (norm + 1e-6) } else { 1.0 } as f32;
         self.steps += 1;
-        let exponent = self.steps.min(i32::MAX as u64) as i32;
-        let (unbias1, unbias2) = (1.0 - BETA1.powi(exponent), 1.0 - BETA2.powi(exponent));
+        let exponent = self.steps as f64;
+        let (unbias1, unbias2) = (1.0 - libm::pow(BETA1, exponent), 1.0 - libm::pow(BETA2, exponent));
         let rate = (rate / unbias1) as f32;
         let (b1, b2) = (BETA1 as f32, BETA2 as f32);
         let (root, epsilon) = ((1.0 / unbias2.sqrt()) as f32, epsilon as f32);

@@ -146,11 +146,18 @@ pub fn write(run: &Path, progress: &Progress, learned: &Learned, keep: u32) -> R
     let bytes = serde_json::to_vec_pretty(&manifest)
         .map_err(|e| CheckpointError::Corrupt { path: folder.join("manifest.json"), reason: e.to_string() })?;
     write_file(&temporary.join("manifest.json"), &bytes)?;
+    // The same iteration once more, after a resume or at a stop: the old one goes only when the new one is in its place.
+    let replaced = parent.join(format!(".{name}.old"));
+    if replaced.exists() {
+        fs::remove_dir_all(&replaced).map_err(io(&replaced))?;
+    }
     if folder.exists() {
-        // The same iteration once more, after a resume from an older checkpoint: the same bits.
-        fs::remove_dir_all(&folder).map_err(io(&folder))?;
+        fs::rename(&folder, &replaced).map_err(io(&folder))?;
     }
     fs::rename(&temporary, &folder).map_err(io(&folder))?;
+    if replaced.exists() {
+        fs::remove_dir_all(&replaced).map_err(io(&replaced))?;
+    }
     // The rename itself must survive a power cut.
     File::open(&parent).and_then(|d| d.sync_all()).map_err(io(&parent))?;
     let surplus = list(run)?;
@@ -178,7 +185,7 @@ pub fn list(run: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
         .map(|e| e.path())
         .filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy().chars().all(|c| c.is_ascii_digit())))
         .collect();
-    folders.sort();
+    folders.sort_by_key(|p| p.file_name().and_then(|n| n.to_string_lossy().parse::<u64>().ok()));
     Ok(folders)
 }
 

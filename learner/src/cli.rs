@@ -73,6 +73,15 @@ pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     telemetry::init(args.log_format);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("magex-net")
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    // A port that cannot be had must not leave a run folder behind.
+    let (incoming, address) =
+        runtime.block_on(server::bind(&args.listen)).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
     let trainer = prepare(&args, &config, &toml)?;
     let identity = RunIdentity {
         run_id: trainer.run_id().clone(),
@@ -83,17 +92,9 @@ pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
         lease,
     };
     let most = (config.mappo.episodes / config.mappo.shards).max(EVAL_SHARD_LIMIT);
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .thread_name("magex-net")
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
     let (handle, mut collector) = learner_service(identity, Limits::for_task(&config.task, most as usize));
     let end = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        let (incoming, address) =
-            server::bind(&args.listen).await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
         process::announce_ready("learner", Some(address));
         let serving = tokio::spawn(serve(handle, incoming, stop.clone()));
         let (ended, training_end) = tokio::sync::oneshot::channel();
@@ -175,8 +176,8 @@ fn prepare(args: &LearnerArgs, config: &RunConfig, toml: &str) -> Result<Trainer
 /// A new run never touches the folder of another.
 fn create_folder(out: &Path, toml: &str) -> Result<(), Failure> {
     let named = |error: &dyn Display| Failure::new(exit::CANNOT_CREATE, format!("{}: {error}", out.display()));
-    if out.join(CONFIG_FILE).exists() {
-        return Err(named(&"there is a run already; continue it with --resume, or choose another --out"));
+    if std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some()) {
+        return Err(named(&"there is something already; continue a run with --resume, or choose another --out"));
     }
     std::fs::create_dir_all(out).map_err(|error| named(&error))?;
     std::fs::write(out.join(CONFIG_FILE), toml).map_err(|error| named(&error))

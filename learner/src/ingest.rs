@@ -84,7 +84,26 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
             return Err(ConvertError::new(format!("trajectory.actions[{place}]"), problem));
         }
     }
+    check_one_to_one(trajectory)?;
     check_metrics("trajectory.metrics", &trajectory.metrics)
+}
+
+/// Every agent has a landmark of its own.
+fn check_one_to_one(trajectory: &Trajectory) -> Result<(), ConvertError> {
+    let shape = &trajectory.shape;
+    if shape.targets != 1 || shape.landmarks < shape.agents {
+        return Ok(());
+    }
+    for (episode, goals) in trajectory.goals.chunks(shape.agents.max(1)).enumerate() {
+        let mut taken = vec![false; shape.landmarks.max(shape.bodies)];
+        for (agent, &goal) in goals.iter().enumerate() {
+            if std::mem::replace(&mut taken[goal as usize], true) {
+                let problem = format!("goal {goal} is assigned twice");
+                return Err(ConvertError::new(format!("trajectory.goals[{episode}][{agent}]"), problem));
+            }
+        }
+    }
+    Ok(())
 }
 
 fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError> {

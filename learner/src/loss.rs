@@ -93,7 +93,7 @@ impl CustomOp1 for PolicyLoss {
                 at += size;
             }
             let difference = log_prob - rows.old_log_probs[r];
-            let ratio = difference.exp();
+            let ratio = libm::expf(difference);
             let advantage = rows.advantages[r];
             let plain = ratio * advantage;
             let clipped = ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage;
@@ -107,7 +107,7 @@ impl CustomOp1 for PolicyLoss {
                 let mut probabilities = [0.0f32; 16];
                 let mut h = 0.0;
                 for (p, l) in probabilities.iter_mut().zip(lp) {
-                    *p = l.exp();
+                    *p = libm::expf(*l);
                     h -= *p * l;
                 }
                 for j in 0..size {

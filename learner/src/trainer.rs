@@ -158,12 +158,14 @@ impl Trainer {
     /// Trains until the target is reached, the budget is spent, or somebody asks to stop.
     pub fn run(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
         let budget = self.config.max_iterations();
+        // Spent on the checkpoint after the line before.
+        let mut checkpoint_s = 0.0;
         loop {
             let iteration = self.progress.iteration;
             self.publish(collector)?;
             let evaluate = iteration.is_multiple_of(self.config.run.eval_every) || iteration >= budget;
             let train = iteration < budget;
-            let mut timing = Timing::default();
+            let mut timing = Timing { checkpoint_s, ..Timing::default() };
 
             // Collect: evaluation of version k and training episodes under version k in one plan, so that no actor idles.
             let clock = Instant::now();
@@ -207,6 +209,9 @@ impl Trainer {
 
             self.progress.iteration += 1;
             self.progress.joint_env_steps += self.config.steps_per_iteration();
+            // The line comes before the checkpoint: a kill in between costs nothing, a resume cuts the line off again.
+            let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
+            self.record(collector, &episodes, evaluation, timing, Some((stats, commander)))?;
             let clock = Instant::now();
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
@@ -218,9 +223,7 @@ impl Trainer {
                 };
                 collector.event(event);
             }
-            timing.checkpoint_s = clock.elapsed().as_secs_f64();
-            let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
-            self.record(collector, &episodes, evaluation, timing, Some((stats, commander)))?;
+            checkpoint_s = clock.elapsed().as_secs_f64();
             if let Some(reason) = stop {
                 return Ok(Outcome::Stopped(reason));
             }

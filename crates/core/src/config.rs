@@ -333,9 +333,7 @@ impl RunConfig {
     pub fn resolved(mut self) -> Result<Self, ConfigError> {
         self.task = self.task.resolved();
         if self.mappo.episodes == 0 {
-            let shards = self.mappo.shards.max(1);
-            let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
-            self.mappo.episodes = wanted.next_multiple_of(shards);
+            self.mappo.episodes = self.derived_episodes();
         }
         self.validate()?;
         Ok(self)
@@ -346,20 +344,27 @@ impl RunConfig {
         toml::to_string(self).map_err(|e| ConfigError::Syntax(e.to_string()))
     }
 
+    /// What `mappo.episodes = 0` stands for: about 200 agents' worth, a multiple of the shards.
+    pub fn derived_episodes(&self) -> u32 {
+        let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
+        wanted.next_multiple_of(self.mappo.shards.max(1))
+    }
+
     /// Joint environment steps of one iteration.
     pub fn steps_per_iteration(&self) -> u64 {
         u64::from(self.mappo.episodes) * u64::from(self.task.horizon)
     }
 
-    /// Iterations that the budget pays for (at least one).
+    /// Whole iterations that the budget pays for (at least one).
     pub fn max_iterations(&self) -> u32 {
-        u32::try_from(self.run.max_steps.div_ceil(self.steps_per_iteration()).max(1)).unwrap_or(u32::MAX)
+        u32::try_from((self.run.max_steps / self.steps_per_iteration().max(1)).max(1)).unwrap_or(u32::MAX)
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
         let range = ConfigError::Range;
         self.task.validate().map_err(range)?;
         let (r, e, c, m) = (&self.run, &self.executor, &self.commander, &self.mappo);
+        within("run.seed", r.seed as f64, 0.0, i64::MAX as f64)?;
         within("run.max_steps", r.max_steps as f64, 1.0, 1e12)?;
         within("run.target_success", r.target_success.into(), 0.0, 2.0)?;
         within("run.eval_every", r.eval_every.into(), 1.0, 1e6)?;

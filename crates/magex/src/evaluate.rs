@@ -65,7 +65,7 @@ pub(crate) struct Variation {
     /// Starts: uniform, lines, lines-0..3, authors or authors-0..3.
     #[arg(long, value_name = "MODE")]
     pub(crate) spawn: Option<Spawn>,
-    /// Team size, at the same density (not for the mlp executor and the ranking scheduler, which are built for one size).
+    /// Team size, on the map that the paper or the density of N = 50 gives it (not for the mlp executor and the ranking scheduler, which are built for one size).
     #[arg(long, value_name = "N")]
     pub(crate) agents: Option<usize>,
     /// Who hands out goals: pairwise, ranking, exact or random.

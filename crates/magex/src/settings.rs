@@ -40,7 +40,12 @@ impl Overrides {
         run.target_success = self.target_success.unwrap_or(run.target_success);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
+            // What was derived from the team size is derived anew; what was chosen stays.
+            let derived = config.mappo.episodes == config.derived_episodes();
             resize(&mut config.task, agents);
+            if derived {
+                config.mappo.episodes = 0;
+            }
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.resolved()

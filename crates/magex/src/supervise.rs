@@ -99,7 +99,18 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
                     }
                     tracing::warn!(reason, "the learner died; starting it again from its checkpoint");
                     tokio::time::sleep(Duration::from_millis(200)).await;
-                    running = learner(&address)?.start().await?;
+                    // A start that fails (killed again, the port still taken) costs a life like any other death.
+                    running = loop {
+                        match learner(&address)?.start().await {
+                            Ok(running) => break running,
+                            Err(error) if lives <= 1 => return Err(error),
+                            Err(error) => {
+                                lives -= 1;
+                                tracing::warn!(%error, "the learner could not be started; trying again");
+                                tokio::time::sleep(Duration::from_secs(1)).await;
+                            }
+                        }
+                    };
                 }
             },
             Some(helper) = helpers.join_next() => {

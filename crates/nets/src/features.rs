@@ -35,7 +35,7 @@ pub struct FeatureSpec {
     pub neighbours: usize,
 }
 
-/// Terminal speed of an agent: 2 units per second (facts of the physics: 0.1 · 5 / 0.25).
+/// Terminal speed of an agent: 2 units per second (0.1 · 5 / 0.25 of the physics).
 const SPEED: f32 = 2.0;
 /// Within this distance the direction to a goal fades, so that it has no jump at the goal.
 const NEAR: f32 = 0.3;

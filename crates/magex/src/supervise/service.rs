@@ -146,7 +146,8 @@ pub(super) async fn keep(service: Service, first: Running, stop: CancellationTok
                 return Ok(());
             }
         };
-        if status.success() {
+        // A helper ends well when the run does; without that it was told to stop from outside, and is needed.
+        if status.success() && tokio::time::timeout(std::time::Duration::from_secs(2), stop.cancelled()).await.is_ok() {
             return Ok(());
         }
         if started.elapsed() >= LONG {
@@ -163,9 +164,18 @@ pub(super) async fn keep(service: Service, first: Running, stop: CancellationTok
             ));
         }
         tracing::warn!(service = service.name, reason, "died; starting it again");
-        if stop.run_until_cancelled(tokio::time::sleep(backoff.next_wait())).await.is_none() {
-            return Ok(());
-        }
-        running = service.start().await?;
+        running = loop {
+            if stop.run_until_cancelled(tokio::time::sleep(backoff.next_wait())).await.is_none() {
+                return Ok(());
+            }
+            match service.start().await {
+                Ok(running) => break running,
+                Err(error) if lives <= 1 => return Err(error),
+                Err(error) => {
+                    lives -= 1;
+                    tracing::warn!(service = service.name, %error, "could not be started; trying again");
+                }
+            }
+        };
     }
 }

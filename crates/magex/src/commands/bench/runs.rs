@@ -187,7 +187,7 @@ pub(super) struct GeneralisationArgs {
 
 pub(super) fn generalisation(args: &GeneralisationArgs) -> anyhow::Result<Report> {
     let title =
-        format!("Other team sizes without training: same density, exact scheduler, greedy, {} starts", args.spawn);
+        format!("Other team sizes without training: density of N = 50, exact scheduler, greedy, {} starts", args.spawn);
     let heading = ["run", "N", "episodes", "success", "matched", "all covered", "arrival", "collisions"];
     let mut report = Report::new("generalisation", title, 1, &heading);
     for run in &args.runs {
