@@ -240,7 +240,9 @@ fn limits(scale: Scale, series: &[Series]) -> (f64, f64) {
     };
     let high = match scale {
         Scale::Share => largest.max(1.0),
-        Scale::FromZero | Scale::FromOne => low + (largest - low) * 1.08,
+        Scale::FromZero => low + (largest - low) * 1.08,
+        // Differences below a percent are noise to look at, and their labels would all read the same.
+        Scale::FromOne => low + ((largest - low) * 1.08).max(0.05),
     };
     // A flat line still needs an axis.
     (low, if high - low > 1e-9 { high } else { low + 0.1 })
