@@ -1,7 +1,21 @@
 //! A hand-written controller: what an agent that knows its goal can reach without learning.
 
+use crate::env::View;
 use crate::error::{EnvError, check_len};
 use crate::physics::Physics;
+use magex_core::task::{TaskConfig, TaskName};
+
+/// The controller of a task: one action [N, H] per joint state, along the axes of the world.
+pub fn scripted(task: &TaskConfig, view: &View<'_>, out: &mut [u8]) -> Result<(), EnvError> {
+    match task.name {
+        TaskName::SimpleSpread => {
+            scripted_actions(view.positions, view.velocities, view.landmarks, view.goals, task.agents, out)
+        }
+        TaskName::PushBall | TaskName::Drones => {
+            Err(EnvError::Task(format!("task.name: {} has no scripted controller", task.name)))
+        }
+    }
+}
 
 /// Chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
 ///

@@ -226,8 +226,19 @@ mod tests {
 
     fn recording() -> Recording {
         Recording {
-            shape: Shape { steps: 1, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, targets: 1, heads: 1 },
+            shape: Shape {
+                steps: 1,
+                episodes: 1,
+                agents: 2,
+                bodies: 2,
+                landmarks: 2,
+                dims: 2,
+                extras: 0,
+                targets: 1,
+                heads: 1,
+            },
             positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
+            extras: vec![],
             landmarks: vec![0.5, 0.0, 1.0, 0.0],
             goals: vec![0, 1],
         }
