@@ -1,6 +1,7 @@
 //! What every task looks like from outside, and the list of them.
 
 use crate::error::EnvError;
+use crate::push_ball::PushBall;
 use crate::spread::Spread;
 use magex_core::rng::Stream;
 use magex_core::task::{TaskConfig, TaskName};
@@ -66,8 +67,8 @@ pub fn new_env(
 ) -> Result<Box<dyn Env>, EnvError> {
     Ok(match task.name {
         TaskName::SimpleSpread => Box::new(Spread::new(task, streams)?),
-        TaskName::PushBall | TaskName::Drones => {
-            let _ = training;
+        TaskName::PushBall => Box::new(PushBall::new(task, streams, training)?),
+        TaskName::Drones => {
             return Err(EnvError::Task(format!("task.name: {} is not built in", task.name)));
         }
     })

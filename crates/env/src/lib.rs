@@ -10,6 +10,7 @@
 pub mod bench;
 pub mod golden;
 pub mod layouts;
+pub mod push_ball;
 pub mod scripted;
 pub mod spawn;
 
@@ -22,8 +23,10 @@ mod matching;
 mod physics;
 mod real;
 mod spread;
+mod swarm;
 
 pub use env::{Env, Score, View, new_env};
 pub use error::EnvError;
+pub use push_ball::PushBall;
 pub use real::Real;
 pub use spread::{CONTACT_DISTANCE, COVER_RADIUS, Spread};
