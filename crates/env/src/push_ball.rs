@@ -1,7 +1,7 @@
 //! Push Ball as the rest of MAGE-X sees it.
 
 mod batch;
-mod law;
+pub(crate) mod law;
 pub mod layouts;
 mod start;
 

@@ -1,4 +1,6 @@
-//! A hand-written controller: what an agent that knows its goal can reach without learning.
+//! Hand-written controllers: what an agent that knows its goals can reach without learning.
+
+mod push_ball;
 
 use crate::env::View;
 use crate::error::{EnvError, check_len};
@@ -17,7 +19,9 @@ pub fn scripted(task: &TaskConfig, view: &View<'_>, out: &mut [u8]) -> Result<()
     }
 }
 
-/// Chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
+pub use push_ball::scripted_push_ball;
+
+/// Simple Spread: chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
 ///
 /// With v' the velocity after the action, the agent moves by dt · v' now and then coasts by
 /// dt · v' · keep / (1 − keep) = 3 dt · v', so it stops at p + 0.4 v'. Ties go to the lower action.

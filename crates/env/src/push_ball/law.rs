@@ -64,7 +64,7 @@ impl<R: Real> Law<R> {
 /// The angle in \[0, π\] between two vectors of the given dot and cross products, `size` the product of their lengths; 0 if
 /// one of them is.
 #[inline(always)]
-fn angle<R: Real>(dot: R, cross: R, size: R) -> R {
+pub(crate) fn angle<R: Real>(dot: R, cross: R, size: R) -> R {
     let cross = if cross < R::ZERO { -cross } else { cross };
     let blunt = dot < R::ZERO;
     // tan(θ / 2) of the acute one of θ and π − θ, at most 1.
