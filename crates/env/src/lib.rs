@@ -8,6 +8,7 @@
 //! No networks, no threads, no clock (except in [`mod@bench`], which measures).
 
 pub mod bench;
+pub mod drones;
 pub mod golden;
 pub mod layouts;
 pub mod scripted;
