@@ -1,0 +1,153 @@
+//! The rapier world of one episode: N drones with cylinder colliders above a ground plane.
+
+use super::model::Craft;
+use rapier3d::prelude::*;
+
+/// Radius of a drone's collision cylinder, m.
+pub const CYLINDER_RADIUS: f32 = 0.06;
+/// Half its height, m; its axis is body z.
+pub const CYLINDER_HALF_HEIGHT: f32 = 0.0125;
+/// No point of the cylinder is farther from the centre than this, m (√(0.06² + 0.0125²), rounded up).
+pub(crate) const REACH: f32 = 0.0613;
+
+/// The mass properties of a drone.
+pub(crate) fn mass_properties(craft: &Craft) -> MassProperties {
+    let [x, y, z] = craft.inertia;
+    MassProperties::new(Vector::ZERO, craft.mass as f32, Vector::new(x as f32, y as f32, z as f32))
+}
+
+/// From the collider, whose axis is y, to the body, whose axis is z: a quarter turn about x.
+pub(crate) fn upright() -> Pose {
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    Pose::from_parts(Vector::ZERO, Rotation::from_xyzw(half, 0.0, 0.0, half))
+}
+
+/// How rapier steps the drones.
+///
+/// One solver iteration: rapier divides a step by that number, and one undivided step is the reference's semi-implicit
+/// Euler. No damping (the reference's is an explicit force), no gyroscopic correction (the reference's explicit term is
+/// a torque), no sleeping (a hovering drone would), no continuous collision detection: contacts are foreseen up to
+/// `foresight` metres, which is how far two drones can approach each other in a step.
+pub(crate) fn parameters(dt: f32, foresight: f32, most_speed: f32) -> IntegrationParameters {
+    IntegrationParameters {
+        dt,
+        num_solver_iterations: 1,
+        max_ccd_substeps: 0,
+        normalized_max_linear_velocity: most_speed,
+        normalized_prediction_distance: foresight,
+        // The default of 5 mm is a fifth of a drone's height.
+        normalized_allowed_linear_error: 0.0005,
+        // Both reuse or merge contacts over 5 cm, the radius of a drone.
+        contact_recycling: false,
+        contact_clustering: false,
+        ..IntegrationParameters::default()
+    }
+}
+
+/// Where a body is and how it moves.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Motion {
+    pub(crate) pose: Pose,
+    pub(crate) linvel: Vector,
+    pub(crate) angvel: Vector,
+}
+
+impl Motion {
+    pub(crate) fn is_finite(&self) -> bool {
+        self.pose.is_finite() && self.linvel.is_finite() && self.angvel.is_finite()
+    }
+}
+
+/// A rapier world.
+pub(crate) struct Engine {
+    world: PhysicsWorld,
+    bodies: Vec<RigidBodyHandle>,
+    colliders: Vec<ColliderHandle>,
+}
+
+impl Engine {
+    /// Drones at given places, no forces.
+    pub(crate) fn new(
+        motions: impl Iterator<Item = Motion>,
+        parameters: IntegrationParameters,
+        gravity: f32,
+        properties: MassProperties,
+    ) -> Self {
+        let mut world = PhysicsWorld::new();
+        world.gravity = Vector::new(0.0, 0.0, -gravity);
+        world.integration_parameters = parameters;
+        world.insert_collider(ColliderBuilder::new(SharedShape::halfspace(Vector::Z)), None);
+        let (mut bodies, mut colliders) = (Vec::new(), Vec::new());
+        for motion in motions {
+            let body = RigidBodyBuilder::dynamic()
+                .pose(motion.pose)
+                .linvel(motion.linvel)
+                .angvel(motion.angvel)
+                .additional_mass_properties(properties)
+                .gyroscopic_forces_enabled(false)
+                .can_sleep(false);
+            let collider =
+                ColliderBuilder::cylinder(CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS).position(upright()).density(0.0);
+            let (body, collider) = world.insert(body, collider);
+            bodies.push(body);
+            colliders.push(collider);
+        }
+        Self { world, bodies, colliders }
+    }
+
+    /// Moves a drone, if it is not there already.
+    pub(crate) fn place(&mut self, drone: usize, motion: &Motion) {
+        let body = &mut self.world.bodies[self.bodies[drone]];
+        if *body.position() != motion.pose {
+            body.set_position(motion.pose, false);
+        }
+        if body.linvel() != motion.linvel {
+            body.set_linvel(motion.linvel, false);
+        }
+        if body.angvel() != motion.angvel {
+            body.set_angvel(motion.angvel, false);
+        }
+    }
+
+    /// Turns a drone into a part of the scenery.
+    pub(crate) fn fix(&mut self, drone: usize) {
+        self.world.bodies[self.bodies[drone]].set_body_type(RigidBodyType::Fixed, false);
+    }
+
+    /// The force and the torque of the next step.
+    pub(crate) fn load(&mut self, drone: usize, force: Vector, torque: Vector) {
+        let body = &mut self.world.bodies[self.bodies[drone]];
+        // rapier keeps forces from step to step.
+        body.reset_forces(false);
+        body.reset_torques(false);
+        body.add_force(force, false);
+        body.add_torque(torque, false);
+    }
+
+    pub(crate) fn step(&mut self) {
+        self.world.step();
+    }
+
+    pub(crate) fn motion(&self, drone: usize) -> Motion {
+        let body = &self.world.bodies[self.bodies[drone]];
+        Motion { pose: *body.position(), linvel: body.linvel(), angvel: body.angvel() }
+    }
+
+    /// Whether rapier has switched a drone off because its state was not finite.
+    pub(crate) fn is_quarantined(&self, drone: usize) -> bool {
+        !self.world.bodies[self.bodies[drone]].is_enabled()
+    }
+
+    /// Marks the drones that a contact pushed during the last step.
+    pub(crate) fn mark_contacts(&self, touched: &mut [bool]) {
+        let pushed = |pair: &&ContactPair| {
+            let points = pair.manifolds().iter().flat_map(|manifold| &manifold.points);
+            points.map(|point| point.data.impulse).any(|impulse| impulse > 0.0)
+        };
+        for pair in self.world.narrow_phase.contact_pairs().filter(pushed) {
+            for (mark, &collider) in touched.iter_mut().zip(&self.colliders) {
+                *mark |= collider == pair.collider1 || collider == pair.collider2;
+            }
+        }
+    }
+}
