@@ -212,6 +212,8 @@ pub struct CommanderConfig {
     pub hidden: usize,
     /// Canonical order of the `ranking` scheduler.
     pub order: CanonicalOrder,
+    /// Share of the training episodes whose goals are a random matching, whatever the scheduler: agents meet more often.
+    pub random_share: f32,
     /// Adam's step size.
     pub learning_rate: f64,
     /// PPO epochs over the iteration's episodes.
@@ -232,6 +234,7 @@ impl Default for CommanderConfig {
             kind: CommanderKind::Pairwise,
             hidden: 32,
             order: CanonicalOrder::Angle,
+            random_share: 0.0,
             learning_rate: 1e-3,
             epochs: 3,
             minibatch: 64,
@@ -382,6 +385,7 @@ impl RunConfig {
         within("executor.hidden", e.hidden as f64, 8.0, 1024.0)?;
         within("executor.neighbours", e.neighbours as f64, 1.0, 64.0)?;
         within("commander.hidden", c.hidden as f64, 4.0, 1024.0)?;
+        within("commander.random_share", c.random_share.into(), 0.0, 1.0)?;
         within("commander.learning_rate", c.learning_rate, 0.0, 1.0)?;
         within("commander.epochs", c.epochs as f64, 1.0, 100.0)?;
         within("commander.minibatch", c.minibatch as f64, 1.0, 1e6)?;

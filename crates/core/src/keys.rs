@@ -2,7 +2,7 @@
 //! goals) and learner (to replay the graph's noise).
 
 use crate::ids::{Shard, ShardKind};
-use crate::rng::{Key, Purpose};
+use crate::rng::{Key, Purpose, Stream};
 
 /// Streams of one episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,4 +41,14 @@ pub fn episode_keys(seed: u64, shard: &Shard, b: u32) -> EpisodeKeys {
             }
         }
     }
+}
+
+/// Whether the b-th episode of a shard gets a random matching instead of the scheduler's, which happens to a given share
+/// of the training episodes and to no evaluation: the stream to draw it from, if so.
+pub fn random_goals(seed: u64, shard: &Shard, b: u32, share: f32) -> Option<Stream> {
+    if shard.kind == ShardKind::Eval || share <= 0.0 {
+        return None;
+    }
+    let mut stream = Key::new(seed, Purpose::RandomGoals, &[shard.iteration.0, shard.first_episode + b]).stream();
+    (stream.uniform32() < share).then_some(stream)
 }

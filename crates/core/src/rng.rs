@@ -38,6 +38,8 @@ pub enum Purpose {
     Request = 12,
     /// Gumbel noise of the executor's graph in sampled evaluation; indices: set, episode.
     EvalGraph = 13,
+    /// Whether a training episode's goals are a random matching, and which; indices: iteration, episode.
+    RandomGoals = 14,
 }
 
 /// The name of a stream.

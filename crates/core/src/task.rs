@@ -1,14 +1,69 @@
-//! What a task is, as data: size, horizon, spawn, reward. No physics.
+//! What a task is, as data: size, horizon, spawn, reward, what is assigned to whom and what an agent sees. No physics.
+//!
+//! This is the list of tasks: a new one is a [`TaskName`] with its row in each `match` below, its physics in `magex-env`
+//! and a configuration file. Everything between (networks, actors, learner, commander) reads the answers given here.
 
+mod drones;
+mod observation;
+mod push_ball;
+
+use crate::trajectory::Shape;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// Which task. The list grows with `magex-env`.
+pub use drones::{Downwash, DroneConfig};
+pub use observation::{Frame, Observation};
+pub use push_ball::PushBallConfig;
+
+/// Which task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TaskName {
     /// Simple Spread (paper, section 5.1.1).
     SimpleSpread,
+    /// Push Ball (paper, section 5.1.1).
+    PushBall,
+    /// Quadrotors on a rigid-body engine (paper, section 5.1.2).
+    Drones,
+}
+
+impl std::fmt::Display for TaskName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::SimpleSpread => "simple-spread",
+            Self::PushBall => "push-ball",
+            Self::Drones => "drones",
+        })
+    }
+}
+
+/// What can be assigned, or be assigned to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Group {
+    /// The N agents.
+    Agents,
+    /// The N balls, which follow the agents among the moving bodies.
+    Balls,
+    /// The N fixed landmarks.
+    Landmarks,
+}
+
+/// One assignment problem of an episode: every member of one group gets a member of another, for itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Stage {
+    /// Who is assigned.
+    pub from: Group,
+    /// To whom.
+    pub to: Group,
+}
+
+/// What the numbers of an action mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ActionCode {
+    /// One component: 0 none, 1 +x, 2 −x, 3 +y, 4 −y.
+    Thrust,
+    /// One component per axis: 0 forward (+), 1 stop, 2 backward (−).
+    PerAxis,
 }
 
 /// Where agents and landmarks start.
@@ -113,49 +168,76 @@ pub struct TaskConfig {
     /// Raw units of the layout files per world unit (layouts only); 0 means 1.5 for N ≤ 20 and 2 beyond.
     #[serde(default)]
     pub layout_scale: f32,
-    /// Reward coefficients.
+    /// Reward coefficients of Simple Spread.
     #[serde(default)]
     pub reward: RewardConfig,
+    /// What only Push Ball has.
+    #[serde(default)]
+    pub push_ball: PushBallConfig,
+    /// What only the drones have.
+    #[serde(default)]
+    pub drones: DroneConfig,
 }
 
-/// Changes whenever the physics, the spawn or the reward change their meaning: part of the fingerprint.
-pub const TASK_SEMANTICS: u32 = 1;
+/// Changes whenever the physics, the spawn, the reward or the observation change their meaning: part of the fingerprint.
+pub const TASK_SEMANTICS: u32 = 2;
 
 impl TaskConfig {
     /// Simple Spread with the paper's sizes for N agents.
     pub fn simple_spread(agents: usize, spawn: Spawn) -> Self {
+        Self::of(TaskName::SimpleSpread, agents, spawn)
+    }
+
+    /// A task with the paper's sizes for N agents.
+    pub fn of(name: TaskName, agents: usize, spawn: Spawn) -> Self {
         Self {
-            name: TaskName::SimpleSpread,
+            name,
             agents,
             side: 0.0,
             horizon: 0,
             spawn,
             layout_scale: 0.0,
             reward: RewardConfig::default(),
+            push_ball: PushBallConfig::default(),
+            drones: DroneConfig::default(),
         }
         .resolved()
     }
 
     /// The same task with every "0 means default" replaced by its value.
     pub fn resolved(mut self) -> Self {
+        let n = self.agents as f32;
+        let tens = |steps: f32| (steps / 10.0).ceil() as u32 * 10;
         if self.side == 0.0 {
-            self.side = match self.agents {
-                5 => 2.0,
-                20 => 6.0,
-                50 => 10.0,
-                n => (2.0 * n as f32).sqrt(),
+            self.side = match (self.name, self.agents) {
+                (TaskName::SimpleSpread, 5) => 2.0,
+                (TaskName::SimpleSpread, 20) => 6.0,
+                (TaskName::SimpleSpread, 50) => 10.0,
+                (TaskName::SimpleSpread, _) => (2.0 * n).sqrt(),
+                (TaskName::PushBall, 5) => 4.0,
+                (TaskName::PushBall, 20) => 12.0,
+                (TaskName::PushBall, _) => (7.2 * n).sqrt(),
+                (TaskName::Drones, _) => 3.0,
             };
         }
         if self.horizon == 0 {
-            self.horizon = match self.agents {
-                5 => 60,
-                20 => 100,
-                50 => 120,
-                _ => ((20.0 + 10.0 * self.side) / 10.0).ceil() as u32 * 10,
+            self.horizon = match (self.name, self.agents) {
+                (TaskName::SimpleSpread, 5) => 60,
+                (TaskName::SimpleSpread, 20) => 100,
+                (TaskName::SimpleSpread, 50) => 120,
+                (TaskName::SimpleSpread, _) => tens(20.0 + 10.0 * self.side),
+                (TaskName::PushBall, 5) => 100,
+                (TaskName::PushBall, 20) => 200,
+                (TaskName::PushBall, _) => tens(20.0 + 15.0 * self.side),
+                (TaskName::Drones, _) => 120,
             };
         }
         if self.layout_scale == 0.0 {
-            self.layout_scale = if self.agents <= 20 { 1.5 } else { 2.0 };
+            self.layout_scale = match self.name {
+                TaskName::PushBall => 0.5,
+                _ if self.agents <= 20 => 1.5,
+                _ => 2.0,
+            };
         }
         if self.reward.distance_unit == 0.0 {
             self.reward.distance_unit = self.side;
@@ -163,17 +245,73 @@ impl TaskConfig {
         self
     }
 
-    /// Space dimensions of positions.
+    /// D: space dimensions of positions.
     pub fn dims(&self) -> usize {
         match self.name {
-            TaskName::SimpleSpread => 2,
+            TaskName::SimpleSpread | TaskName::PushBall => 2,
+            TaskName::Drones => 3,
         }
+    }
+
+    /// Moving bodies that are not agents.
+    pub fn balls(&self) -> usize {
+        if self.name == TaskName::PushBall { self.agents } else { 0 }
+    }
+
+    /// X: further numbers of an agent's state that an agent sees and the wire carries.
+    pub fn extras(&self) -> usize {
+        if self.name == TaskName::Drones { DroneConfig::EXTRAS } else { 0 }
     }
 
     /// Choices of each action component.
     pub fn action_heads(&self) -> Vec<usize> {
+        match self.action_code() {
+            ActionCode::Thrust => vec![5],
+            ActionCode::PerAxis => vec![3; self.dims()],
+        }
+    }
+
+    /// What the numbers of an action mean.
+    pub fn action_code(&self) -> ActionCode {
         match self.name {
-            TaskName::SimpleSpread => vec![5],
+            TaskName::SimpleSpread | TaskName::PushBall => ActionCode::Thrust,
+            TaskName::Drones => ActionCode::PerAxis,
+        }
+    }
+
+    /// The assignment problems of an episode, in order. The k-th goal of an agent is found by following the first k + 1 of
+    /// them from the agent.
+    pub fn stages(&self) -> &'static [Stage] {
+        match self.name {
+            TaskName::SimpleSpread | TaskName::Drones => &[Stage { from: Group::Agents, to: Group::Landmarks }],
+            TaskName::PushBall => &[
+                Stage { from: Group::Agents, to: Group::Balls },
+                Stage { from: Group::Balls, to: Group::Landmarks },
+            ],
+        }
+    }
+
+    /// What an agent sees.
+    pub fn observation(&self) -> Observation {
+        match self.name {
+            TaskName::SimpleSpread => Observation::default(),
+            TaskName::PushBall => push_ball::observation(),
+            TaskName::Drones => drones::observation(),
+        }
+    }
+
+    /// Sizes of the arrays of a shard of so many episodes.
+    pub fn shape(&self, episodes: usize) -> Shape {
+        Shape {
+            steps: self.horizon as usize,
+            episodes,
+            agents: self.agents,
+            bodies: self.agents + self.balls(),
+            landmarks: self.agents,
+            dims: self.dims(),
+            extras: self.extras(),
+            targets: self.stages().len(),
+            heads: self.action_heads().len(),
         }
     }
 
@@ -191,25 +329,50 @@ impl TaskConfig {
         if !(self.layout_scale.is_finite() && self.layout_scale > 0.0) {
             return Err(format!("task.layout_scale: {} must be positive", self.layout_scale));
         }
-        let r = &self.reward;
-        for (name, value) in [("bonus", r.bonus), ("distance", r.distance), ("collision", r.collision)] {
-            if !(value.is_finite() && (0.0..=1000.0).contains(&value)) {
-                return Err(format!("task.reward.{name}: {value} is outside 0..=1000"));
+        self.refuse_settings_of_other_tasks()?;
+        match self.name {
+            TaskName::SimpleSpread => {
+                let r = &self.reward;
+                coefficients(
+                    "task.reward",
+                    &[("bonus", r.bonus), ("distance", r.distance), ("collision", r.collision)],
+                )?;
+                if !(r.distance_unit.is_finite() && r.distance_unit > 0.0) {
+                    return Err(format!("task.reward.distance_unit: {} must be positive", r.distance_unit));
+                }
+                if self.spawn == Spawn::Uniform {
+                    self.check_room("agents", self.agents, 0.2)?;
+                }
+                Ok(())
             }
+            TaskName::PushBall => push_ball::validate(self),
+            TaskName::Drones => drones::validate(self),
         }
-        if !(r.distance_unit.is_finite() && r.distance_unit > 0.0) {
-            return Err(format!("task.reward.distance_unit: {} must be positive", r.distance_unit));
+    }
+
+    /// Random sequential placement of discs jams near 0.547 of the area; half of that is quick to sample.
+    fn check_room(&self, what: &str, count: usize, spacing: f32) -> Result<(), String> {
+        let discs = count as f32 * std::f32::consts::PI * (spacing / 2.0).powi(2);
+        if discs > 0.27 * self.side * self.side {
+            return Err(format!(
+                "task.side: {count} {what} do not fit a side of {} at a spacing of {spacing}; use a side of at least {:.2}",
+                self.side,
+                (discs / 0.27).sqrt()
+            ));
         }
-        if self.spawn == Spawn::Uniform {
-            // Random sequential placement of discs jams near 0.547 of the area; half of that is quick to sample.
-            let discs = self.agents as f32 * std::f32::consts::PI * 0.1 * 0.1;
-            if discs > 0.27 * self.side * self.side {
-                return Err(format!(
-                    "task.side: {} agents do not fit a side of {} without overlap; use a side of at least {:.2}",
-                    self.agents,
-                    self.side,
-                    (discs / 0.27).sqrt()
-                ));
+        Ok(())
+    }
+
+    /// A setting that this task does not read would look as if it did something.
+    fn refuse_settings_of_other_tasks(&self) -> Result<(), String> {
+        let reward = RewardConfig { distance_unit: self.reward.distance_unit, ..RewardConfig::default() };
+        for (section, owner, untouched) in [
+            ("task.reward", TaskName::SimpleSpread, self.reward == reward),
+            ("task.push_ball", TaskName::PushBall, self.push_ball == PushBallConfig::default()),
+            ("task.drones", TaskName::Drones, self.drones == DroneConfig::default()),
+        ] {
+            if owner != self.name && !untouched {
+                return Err(format!("{section}: belongs to {owner}, the task is {}; remove it", self.name));
             }
         }
         Ok(())
@@ -219,6 +382,14 @@ impl TaskConfig {
     pub fn fingerprint(&self) -> String {
         let text = serde_json::to_string(&(TASK_SEMANTICS, self)).unwrap_or_default();
         Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+/// Ranges of reward coefficients.
+fn coefficients(section: &str, values: &[(&str, f32)]) -> Result<(), String> {
+    match values.iter().find(|(_, value)| !(value.is_finite() && (0.0..=1000.0).contains(value))) {
+        Some((name, value)) => Err(format!("{section}.{name}: {value} is outside 0..=1000")),
+        None => Ok(()),
     }
 }
 

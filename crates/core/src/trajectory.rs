@@ -12,13 +12,15 @@ pub struct Shape {
     pub episodes: usize,
     /// N: agents.
     pub agents: usize,
-    /// E: moving bodies, agents first (Simple Spread: E = N).
+    /// E: moving bodies, agents first, then balls (Push Ball: E = 2N, otherwise N).
     pub bodies: usize,
     /// G: fixed landmarks.
     pub landmarks: usize,
     /// D: space dimensions.
     pub dims: usize,
-    /// K: targets per agent (Simple Spread: 1, its landmark).
+    /// X: further numbers of an agent's state (drones: 6).
+    pub extras: usize,
+    /// K: targets per agent (Simple Spread: 1, its landmark; Push Ball: 2, its ball and the ball's landmark).
     pub targets: usize,
     /// H: components of an action.
     pub heads: usize,
@@ -36,21 +38,23 @@ pub struct Trajectory {
     pub positions: Vec<f32>,
     /// [T+1, B, E, D] world units per second.
     pub velocities: Vec<f32>,
+    /// [T+1, B, N, X] further state of the agents, by task.
+    pub extras: Vec<f32>,
     /// [B, G, D] world units.
     pub landmarks: Vec<f32>,
-    /// [B, N, K] what each agent was assigned: an index into landmarks (or into the bodies, by task).
+    /// [B, N, K] what each agent was assigned: the k-th is an index into the group that the task's k-th stage leads to.
     pub goals: Vec<u32>,
-    /// [T, B, N, H]
+    /// [T, B, N, H] in the agent's own frame, as the policy chose them.
     pub actions: Vec<u8>,
     /// [T, B, N] log-probability of the whole action under the weights named by the shard.
     pub log_probs: Vec<f32>,
     /// [T, B, N]
     pub rewards: Vec<f32>,
-    /// `[B]` log-probability of the commander's assignment.
+    /// [B, K] log-probability of the commander's assignment of each stage.
     pub goal_log_probs: Vec<f32>,
-    /// `[B]` C_c: summed distance of the commander's assignment.
+    /// [B, K] C_c: summed distance of the commander's assignment.
     pub costs: Vec<f32>,
-    /// `[B]` C_h: summed distance of the exact assignment.
+    /// [B, K] C_h: summed distance of the exact assignment.
     pub exact_costs: Vec<f32>,
     /// `[B]` metrics of each episode.
     pub metrics: Vec<EpisodeMetrics>,
@@ -59,18 +63,25 @@ pub struct Trajectory {
 /// What one episode scored.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeMetrics {
-    /// Share of landmarks with any agent within 0.15 at the last step.
+    /// Share of landmarks that are covered at the last step: by any agent within 0.15, by any ball within 0.30 (Push Ball),
+    /// by any drone within 0.15 that has not crashed.
     pub success: f32,
-    /// Share of landmarks that can be matched one-to-one to agents within 0.15 at the last step.
+    /// Share of landmarks that can be matched one-to-one to what covers them; Push Ball: that are covered by their own ball.
     pub matched_success: f32,
+    /// Share of landmarks that were covered before the first step.
+    pub spawn_success: f32,
     /// First step after which at least 99 % of the landmarks were covered; the horizon + 1 if it never happened.
     pub arrival_step: u32,
     /// Other agents closer than two radii, per agent and step.
     pub collisions_per_agent_step: f32,
+    /// Share of the agents that crashed; 0 in tasks where nothing crashes.
+    pub collision_rate: f32,
     /// Mean reward per agent and step.
     pub reward: f32,
-    /// C_c / C_h at the start of the episode.
+    /// C_c / C_h at the start of the episode: agents to their (first) goals.
     pub cost_ratio: f32,
+    /// The same of the second stage (balls to landmarks), if the task has one.
+    pub second_cost_ratio: Option<f32>,
 }
 
 /// The states of one episode, to be looked at.
@@ -80,6 +91,8 @@ pub struct Recording {
     pub shape: Shape,
     /// [T+1, E, D]
     pub positions: Vec<f32>,
+    /// [T+1, N, X]
+    pub extras: Vec<f32>,
     /// [G, D]
     pub landmarks: Vec<f32>,
     /// [N, K]
@@ -123,15 +136,16 @@ impl Trajectory {
         let s = &self.shape;
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
-        let floats: [(&str, &[f32], usize); 8] = [
+        let floats: [(&str, &[f32], usize); 9] = [
             ("positions", &self.positions, state),
             ("velocities", &self.velocities, state),
+            ("extras", &self.extras, (t + 1) * b * n * s.extras),
             ("landmarks", &self.landmarks, b * s.landmarks * s.dims),
             ("log_probs", &self.log_probs, t * b * n),
             ("rewards", &self.rewards, t * b * n),
-            ("goal_log_probs", &self.goal_log_probs, b),
-            ("costs", &self.costs, b),
-            ("exact_costs", &self.exact_costs, b),
+            ("goal_log_probs", &self.goal_log_probs, b * s.targets),
+            ("costs", &self.costs, b * s.targets),
+            ("exact_costs", &self.exact_costs, b * s.targets),
         ];
         for (name, data, expected) in floats {
             if data.len() != expected {

@@ -17,12 +17,14 @@ pub mod spawn;
 mod arrival;
 mod batch;
 mod cells;
+mod env;
 mod error;
 mod matching;
 mod physics;
 mod real;
 mod spread;
 
+pub use env::{Env, Score, View, new_env};
 pub use error::EnvError;
 pub use real::Real;
 pub use spread::{CONTACT_DISTANCE, COVER_RADIUS, Spread};

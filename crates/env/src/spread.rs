@@ -1,12 +1,12 @@
 //! Simple Spread as the rest of MAGE-X sees it.
 
 use crate::batch::Batch;
+use crate::env::{Env, Score};
 use crate::error::{EnvError, check_finite, check_len};
 use crate::matching::maximum_matching;
 use crate::spawn;
 use magex_core::rng::Stream;
 use magex_core::task::TaskConfig;
-use magex_core::trajectory::EpisodeMetrics;
 
 /// A landmark is covered when an agent's centre is within this distance (agent radius 0.1 + landmark radius 0.05).
 pub const COVER_RADIUS: f64 = 0.15;
@@ -31,6 +31,8 @@ pub struct Spread {
     horizon: u32,
     steps: u32,
     goals: Vec<u32>,
+    /// `[B]`
+    spawn_success: Vec<f32>,
 }
 
 /// Small worlds share registers; a large one, or one of a few, is looked at by itself.
@@ -79,15 +81,12 @@ impl Spread {
         } else {
             Worlds::Cells(Batch::new(task, positions, velocities, landmarks, true))
         };
-        Self { worlds, agents: task.agents, horizon: task.horizon, steps: 0, goals: Vec::new() }
-    }
-
-    /// B.
-    pub fn episodes(&self) -> usize {
-        match &self.worlds {
-            Worlds::Lanes(batch) => batch.worlds(),
-            Worlds::Cells(batch) => batch.worlds(),
-        }
+        let near = |world| match &worlds {
+            Worlds::Lanes(batch) => batch.near(world),
+            Worlds::Cells(batch) => batch.near(world),
+        };
+        let spawn_success = (0..episodes).map(|world| covered(&near(world), task.agents)).collect();
+        Self { worlds, agents: task.agents, horizon: task.horizon, steps: 0, goals: Vec::new(), spawn_success }
     }
 
     /// N.
@@ -100,42 +99,9 @@ impl Spread {
         self.horizon
     }
 
-    /// Joint steps done so far, up to T.
-    pub fn steps(&self) -> u32 {
-        self.steps
-    }
-
-    /// `[B, N, 2]`
-    pub fn landmarks(&self) -> &[f32] {
-        match &self.worlds {
-            Worlds::Lanes(batch) => batch.landmarks(),
-            Worlds::Cells(batch) => batch.landmarks(),
-        }
-    }
-
     /// `[B, N]` landmark of each agent; empty until they are set.
     pub fn goals(&self) -> &[u32] {
         &self.goals
-    }
-
-    /// Writes the present positions `[B, N, 2]`.
-    pub fn write_positions(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("positions", out.len(), 2 * self.numbers())?;
-        match &self.worlds {
-            Worlds::Lanes(batch) => batch.write_positions(out),
-            Worlds::Cells(batch) => batch.write_positions(out),
-        }
-        Ok(())
-    }
-
-    /// Writes the present velocities `[B, N, 2]`.
-    pub fn write_velocities(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("velocities", out.len(), 2 * self.numbers())?;
-        match &self.worlds {
-            Worlds::Lanes(batch) => batch.write_velocities(out),
-            Worlds::Cells(batch) => batch.write_velocities(out),
-        }
-        Ok(())
     }
 
     /// The present positions `[B, N, 2]`.
@@ -158,8 +124,72 @@ impl Spread {
         out
     }
 
-    /// Assigns a landmark to every agent, `[B, N]`. Several agents may share one.
-    pub fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError> {
+    fn score(&self, world: usize) -> Score {
+        let (near, arrival, (reward, hits)) = match &self.worlds {
+            Worlds::Lanes(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
+            Worlds::Cells(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
+        };
+        let share = |count: usize| (count as f64 / self.agents as f64) as f32;
+        let agent_steps = f64::from(self.steps.max(1)) * self.agents as f64;
+        Score {
+            success: covered(&near, self.agents),
+            matched_success: share(maximum_matching(&near, self.agents)),
+            spawn_success: self.spawn_success[world],
+            arrival_step: arrival.unwrap_or(self.horizon + 1),
+            collisions_per_agent_step: (hits / agent_steps) as f32,
+            collision_rate: 0.0,
+            reward: (reward / agent_steps) as f32,
+        }
+    }
+
+    /// B · N.
+    fn numbers(&self) -> usize {
+        self.episodes() * self.agents
+    }
+}
+
+impl Env for Spread {
+    fn episodes(&self) -> usize {
+        match &self.worlds {
+            Worlds::Lanes(batch) => batch.worlds(),
+            Worlds::Cells(batch) => batch.worlds(),
+        }
+    }
+
+    fn steps(&self) -> u32 {
+        self.steps
+    }
+
+    fn landmarks(&self) -> &[f32] {
+        match &self.worlds {
+            Worlds::Lanes(batch) => batch.landmarks(),
+            Worlds::Cells(batch) => batch.landmarks(),
+        }
+    }
+
+    fn write_positions(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("positions", out.len(), 2 * self.numbers())?;
+        match &self.worlds {
+            Worlds::Lanes(batch) => batch.write_positions(out),
+            Worlds::Cells(batch) => batch.write_positions(out),
+        }
+        Ok(())
+    }
+
+    fn write_velocities(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("velocities", out.len(), 2 * self.numbers())?;
+        match &self.worlds {
+            Worlds::Lanes(batch) => batch.write_velocities(out),
+            Worlds::Cells(batch) => batch.write_velocities(out),
+        }
+        Ok(())
+    }
+
+    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("extras", out.len(), 0)
+    }
+
+    fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError> {
         check_len("goals", goals.len(), self.numbers())?;
         if let Some(place) = goals.iter().position(|&goal| goal as usize >= self.agents) {
             return Err(EnvError::Goal { place, goal: goals[place], landmarks: self.agents });
@@ -173,9 +203,7 @@ impl Spread {
         Ok(())
     }
 
-    /// One joint step of every episode. `actions` `[B, N]`: 0 none, 1 +x, 2 −x, 3 +y, 4 −y; `rewards` `[B, N]` is
-    /// overwritten with the reward of the state after the step ([`magex_core::task::RewardConfig`]).
-    pub fn step(&mut self, actions: &[u8], rewards: &mut [f32]) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32]) -> Result<(), EnvError> {
         check_len("actions", actions.len(), self.numbers())?;
         check_len("rewards", rewards.len(), self.numbers())?;
         if self.goals.len() != self.numbers() {
@@ -196,34 +224,14 @@ impl Spread {
         Ok(())
     }
 
-    /// What each episode scored up to now; after T steps, its final score. `cost_ratios` `[B]` is C_c / C_h of each
-    /// episode's goals, which the environment does not know.
-    pub fn metrics(&self, cost_ratios: &[f32]) -> Result<Vec<EpisodeMetrics>, EnvError> {
-        check_len("cost_ratios", cost_ratios.len(), self.episodes())?;
-        Ok(cost_ratios.iter().enumerate().map(|(world, &cost_ratio)| self.score(world, cost_ratio)).collect())
+    fn scores(&self) -> Vec<Score> {
+        (0..self.episodes()).map(|world| self.score(world)).collect()
     }
+}
 
-    fn score(&self, world: usize, cost_ratio: f32) -> EpisodeMetrics {
-        let (near, arrival, (reward, hits)) = match &self.worlds {
-            Worlds::Lanes(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
-            Worlds::Cells(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
-        };
-        let share = |count: usize| (count as f64 / self.agents as f64) as f32;
-        let agent_steps = f64::from(self.steps.max(1)) * self.agents as f64;
-        EpisodeMetrics {
-            success: share(near.iter().filter(|agents| !agents.is_empty()).count()),
-            matched_success: share(maximum_matching(&near, self.agents)),
-            arrival_step: arrival.unwrap_or(self.horizon + 1),
-            collisions_per_agent_step: (hits / agent_steps) as f32,
-            reward: (reward / agent_steps) as f32,
-            cost_ratio,
-        }
-    }
-
-    /// B · N.
-    fn numbers(&self) -> usize {
-        self.episodes() * self.agents
-    }
+/// Share of landmarks with anything near.
+fn covered(near: &[Vec<u32>], landmarks: usize) -> f32 {
+    (near.iter().filter(|agents| !agents.is_empty()).count() as f64 / landmarks as f64) as f32
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used)]
 
 use magex_core::task::{Spawn, TaskConfig};
-use magex_env::Spread;
+use magex_env::{Env as _, Spread};
 use proptest::prelude::*;
 
 /// B worlds of N agents: positions (crowded, some coincident), velocities, landmarks, goals, and T joint actions.
@@ -86,7 +86,7 @@ proptest! {
     #[test]
     fn a_world_does_not_see_its_neighbours(case in cases()) {
         let (together, log) = case.play();
-        let metrics = together.metrics(&vec![1.0; case.worlds()]).unwrap();
+        let metrics = together.scores();
         for (b, metrics) in metrics.iter().enumerate() {
             let (alone, own) = case.only(b).play();
             for (all, own) in log.iter().zip(&own) {
@@ -95,7 +95,7 @@ proptest! {
                     prop_assert_eq!(bits(&all[own_range]), bits(own));
                 }
             }
-            prop_assert_eq!(&alone.metrics(&[1.0]).unwrap()[0], metrics);
+            prop_assert_eq!(&alone.scores()[0], metrics);
         }
     }
 
@@ -103,7 +103,7 @@ proptest! {
     fn numbers_stay_finite_and_rates_in_range(case in cases()) {
         let (spread, log) = case.play();
         prop_assert!(log.iter().flatten().flatten().all(|value| value.is_finite()));
-        for m in spread.metrics(&vec![1.0; case.worlds()]).unwrap() {
+        for m in spread.scores() {
             prop_assert!((0.0..=1.0).contains(&m.success));
             prop_assert!(m.matched_success <= m.success);
             prop_assert!(m.arrival_step >= 1 && m.arrival_step <= spread.horizon() + 1);

@@ -6,7 +6,7 @@
 
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
-use magex_core::trajectory::EpisodeMetrics;
+use magex_env::{Env as _, Score};
 use magex_env::Spread;
 use magex_env::scripted::scripted_actions;
 
@@ -62,7 +62,7 @@ fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> 
     worlds.flat_map(solve).collect()
 }
 
-fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
+fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<Score> {
     let task = TaskConfig::simple_spread(agents, spawn);
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
     let mut spread = Spread::new(&task, streams).unwrap();
@@ -78,12 +78,12 @@ fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
         scripted_actions(&positions, &velocities, &landmarks, &goals, agents, &mut actions).unwrap();
         spread.step(&actions, &mut rewards).unwrap();
     }
-    spread.metrics(&vec![1.0; episodes as usize]).unwrap()
+    spread.scores()
 }
 
 fn check(agents: usize, spawn: Spawn, at_least: f32, arrival_below: f32) {
     let metrics = play(agents, spawn, 400);
-    let mean = |value: fn(&EpisodeMetrics) -> f32| metrics.iter().map(value).sum::<f32>() / metrics.len() as f32;
+    let mean = |value: fn(&Score) -> f32| metrics.iter().map(value).sum::<f32>() / metrics.len() as f32;
     let (success, arrival) = (mean(|m| m.success), mean(|m| m.arrival_step as f32));
     assert!(success >= at_least, "{agents} {spawn}: success {success}");
     assert!(arrival < arrival_below, "{agents} {spawn}: arrival {arrival}");

@@ -60,11 +60,10 @@ fn overlapping_agents_pay_for_each_other_and_not_for_themselves() {
     let mut spread = Spread::from_state(&task, &positions, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0], &positions).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     spread.step(&[1, 0, 0], &mut rewards).unwrap();
-    let metrics = spread.metrics(&[1.25]).unwrap()[0];
+    let metrics = spread.scores()[0];
     assert!(rewards[0] < 0.1 && rewards[1] < 0.1 && rewards[2] == 1.0, "{rewards:?}");
     assert_eq!(metrics.collisions_per_agent_step, 2.0 / 3.0);
     assert!((metrics.reward - rewards.iter().sum::<f32>() / 3.0).abs() < 1e-6);
-    assert_eq!(metrics.cost_ratio, 1.25);
 }
 
 #[test]
@@ -77,7 +76,7 @@ fn success_counts_any_agent_and_matched_success_only_its_own() {
     let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     spread.step(&[0; 3], &mut [0.0; 3]).unwrap();
-    let metrics = spread.metrics(&[1.0]).unwrap()[0];
+    let metrics = spread.scores()[0];
     assert_eq!((metrics.success, metrics.matched_success), (2.0 / 3.0, 1.0 / 3.0));
     assert_eq!(metrics.arrival_step, task.horizon + 1);
 }
@@ -108,7 +107,7 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
             }
         }
         assert_eq!(arrives, expected < 11);
-        let metrics = spread.metrics(&[1.0]).unwrap()[0];
+        let metrics = spread.scores()[0];
         assert_eq!(metrics.arrival_step, expected, "N = {agents}, {missing} missing");
     }
 }
@@ -137,9 +136,9 @@ fn an_episode_is_the_same_alone_and_in_any_batch() {
                 assert_eq!(spread.positions(), positions[2 * own.start..2 * own.end]);
             }
         }
-        let metrics = together.metrics(&vec![1.0; episodes as usize]).unwrap();
+        let metrics = together.scores();
         for (spread, metrics) in alone.iter().zip(metrics) {
-            assert_eq!(spread.metrics(&[1.0]).unwrap(), [metrics]);
+            assert_eq!(spread.scores(), [metrics]);
         }
     }
 }
@@ -194,7 +193,6 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(spread.step(&[0; 9], &mut rewards).is_err());
     assert!(spread.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(spread.write_positions(&mut [0.0; 19]).is_err());
-    assert!(spread.metrics(&[1.0]).is_err());
     assert_eq!((spread.positions(), spread.steps()), (before, 0));
     for _ in 0..task.horizon {
         spread.step(&[0; 10], &mut rewards).unwrap();

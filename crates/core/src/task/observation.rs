@@ -1,0 +1,49 @@
+//! What an agent sees of a joint state, as numbers that the networks' features are made with.
+
+/// The axes that an agent sees the world along.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Frame {
+    /// The axes of the world.
+    #[default]
+    World,
+    /// The axes of the world, mirrored and swapped so that the last leg of the agent's way (ball → landmark) points into
+    /// the first octant. The policy need not learn eight copies of one skill; its actions are turned back.
+    Octant,
+}
+
+/// Sizes that a task's features are measured with. Lengths are world units.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Observation {
+    /// Unit of velocities, world units per second.
+    pub speed: f32,
+    /// Within this distance the direction to a target fades, so that it has no jump at the target.
+    pub near: f32,
+    /// Bodies farther than this are not seen as neighbours.
+    pub reach: f32,
+    /// Distance at which the last target counts as reached.
+    pub reached: f32,
+    /// Distance at which two agents touch.
+    pub contact: f32,
+    /// The axes that an agent sees the world along.
+    pub frame: Frame,
+    /// Neighbours are seen with the time and the offset of their closest approach, by every executor.
+    pub encounters: bool,
+    /// Which of an agent's extras says (by 1) that it is out of the episode: others do not see it any more.
+    pub out: Option<usize>,
+}
+
+impl Default for Observation {
+    /// Simple Spread.
+    fn default() -> Self {
+        Self {
+            speed: 2.0,
+            near: 0.3,
+            reach: 1.0,
+            reached: 0.15,
+            contact: 0.2,
+            frame: Frame::World,
+            encounters: false,
+            out: None,
+        }
+    }
+}

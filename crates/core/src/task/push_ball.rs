@@ -1,0 +1,54 @@
+//! Push Ball as data.
+
+use super::{Frame, Observation, Spawn, TaskConfig, coefficients};
+use serde::{Deserialize, Serialize};
+
+/// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + arc · θ ·
+/// min(1, d_bl / 0.3), d_ab the distance agent–ball, d_bl ball–landmark, θ the angle between the two legs:
+/// r = progress · (Φ' − Φ) + bonus · 1\[d_bl ≤ 0.3\] − distance · (d_ab + d_bl).
+///
+/// The authors' reward is progress = 0, bonus = 1, distance = 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PushBallConfig {
+    /// Paid per unit of way made good.
+    pub progress: f32,
+    /// World units per radian that the ball must be walked around.
+    pub arc: f32,
+    /// Paid on every step on which the ball is within 0.3 of its landmark.
+    pub bonus: f32,
+    /// Charged per unit of distance left, on every step.
+    pub distance: f32,
+    /// Share of the training episodes in which agents start in line with balls: starts that random positions never
+    /// show, and fixed layouts do.
+    pub aligned: f32,
+}
+
+impl Default for PushBallConfig {
+    fn default() -> Self {
+        Self { progress: 2.0, arc: 0.25, bonus: 0.1, distance: 0.0, aligned: 0.3 }
+    }
+}
+
+/// Closest that balls, and landmarks, start to one another.
+const SPACING: f32 = 0.3;
+
+pub(super) fn observation() -> Observation {
+    Observation { reach: 1.5, reached: 0.3, frame: Frame::Octant, ..Observation::default() }
+}
+
+pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
+    let p = &task.push_ball;
+    coefficients(
+        "task.push_ball",
+        &[("progress", p.progress), ("arc", p.arc), ("bonus", p.bonus), ("distance", p.distance)],
+    )?;
+    if !(0.0..=1.0).contains(&p.aligned) {
+        return Err(format!("task.push_ball.aligned: {} is outside 0..=1", p.aligned));
+    }
+    if task.spawn == Spawn::Uniform {
+        // Agents keep 0.25 from balls and 0.2 from each other: together they need little more room than twice the balls.
+        task.check_room("balls with as many agents", 2 * task.agents, SPACING)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,90 @@
+//! What every task looks like from outside, and the list of them.
+
+use crate::error::EnvError;
+use crate::spread::Spread;
+use magex_core::rng::Stream;
+use magex_core::task::{TaskConfig, TaskName};
+
+/// B episodes of a task, stepped together. Arrays are row-major, lengths in world units, times in seconds; sizes are those
+/// of [`TaskConfig::shape`].
+///
+/// Episode b is a function of the task, its stream, its goals and its actions: not of B, not of b.
+pub trait Env: Send {
+    /// B.
+    fn episodes(&self) -> usize;
+
+    /// Joint steps done so far, up to T.
+    fn steps(&self) -> u32;
+
+    /// [B, G, D]
+    fn landmarks(&self) -> &[f32];
+
+    /// Writes the present positions [B, E, D], agents first, then balls.
+    fn write_positions(&self, out: &mut [f32]) -> Result<(), EnvError>;
+
+    /// Writes the present velocities [B, E, D].
+    fn write_velocities(&self, out: &mut [f32]) -> Result<(), EnvError>;
+
+    /// Writes the further state of the agents [B, N, X].
+    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError>;
+
+    /// Assigns goals [B, N, K]; see [`TaskConfig::stages`].
+    fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError>;
+
+    /// One joint step of every episode. `actions` [B, N, H] along the axes of the world; `rewards` [B, N] is overwritten
+    /// with the reward of the state after the step.
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32]) -> Result<(), EnvError>;
+
+    /// `[B]` what each episode scored up to now; after T steps, its final score.
+    fn scores(&self) -> Vec<Score>;
+}
+
+/// What an episode scored, as far as the environment knows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Score {
+    /// Share of landmarks that are covered.
+    pub success: f32,
+    /// Share of landmarks that can be matched one-to-one to what covers them; Push Ball: covered by their own ball.
+    pub matched_success: f32,
+    /// Share of landmarks that were covered before the first step.
+    pub spawn_success: f32,
+    /// First step after which at least 99 % of the landmarks were covered; T + 1 if it never happened.
+    pub arrival_step: u32,
+    /// Other agents in contact, per agent and step.
+    pub collisions_per_agent_step: f32,
+    /// Share of the agents that crashed; 0 in tasks where nothing crashes.
+    pub collision_rate: f32,
+    /// Mean reward per agent and step.
+    pub reward: f32,
+}
+
+/// Episodes of a task, one per stream. In training, starts that help learning may be mixed in.
+pub fn new_env(
+    task: &TaskConfig,
+    streams: impl Iterator<Item = Stream>,
+    training: bool,
+) -> Result<Box<dyn Env>, EnvError> {
+    Ok(match task.name {
+        TaskName::SimpleSpread => Box::new(Spread::new(task, streams)?),
+        TaskName::PushBall | TaskName::Drones => {
+            let _ = training;
+            return Err(EnvError::Task(format!("task.name: {} is not built in", task.name)));
+        }
+    })
+}
+
+/// What a scripted controller sees of S joint states; landmarks and goals are those of Q episodes, state s belonging to
+/// episode s modulo Q.
+#[derive(Debug, Clone, Copy)]
+pub struct View<'a> {
+    /// [S, E, D]
+    pub positions: &'a [f32],
+    /// [S, E, D]
+    pub velocities: &'a [f32],
+    /// [S, N, X]
+    pub extras: &'a [f32],
+    /// [Q, G, D]
+    pub landmarks: &'a [f32],
+    /// [Q, N, K]
+    pub goals: &'a [u32],
+}
