@@ -7,3 +7,6 @@ pub mod control;
 pub mod model;
 
 pub(crate) mod linalg;
+pub(crate) mod world;
+
+mod engine;

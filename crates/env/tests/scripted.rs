@@ -6,9 +6,9 @@
 
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
-use magex_env::{Env as _, Score};
 use magex_env::Spread;
 use magex_env::scripted::scripted_actions;
+use magex_env::{Env as _, Score};
 
 /// Exact assignment by shortest augmenting paths; `cost` is [n, n], the result maps rows to columns.
 fn assign(cost: &[f64], n: usize) -> Vec<u32> {

@@ -58,6 +58,13 @@ impl Motion {
     }
 }
 
+/// What a drone touched in a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Touch {
+    pub(crate) drone: bool,
+    pub(crate) ground: bool,
+}
+
 /// A rapier world.
 pub(crate) struct Engine {
     world: PhysicsWorld,
@@ -138,15 +145,18 @@ impl Engine {
         !self.world.bodies[self.bodies[drone]].is_enabled()
     }
 
-    /// Marks the drones that a contact pushed during the last step.
-    pub(crate) fn mark_contacts(&self, touched: &mut [bool]) {
+    /// Marks what pushed each drone during the last step.
+    pub(crate) fn mark_contacts(&self, touches: &mut [Touch]) {
         let pushed = |pair: &&ContactPair| {
             let points = pair.manifolds().iter().flat_map(|manifold| &manifold.points);
             points.map(|point| point.data.impulse).any(|impulse| impulse > 0.0)
         };
+        let drone = |collider: ColliderHandle| self.colliders.iter().position(|&own| own == collider);
         for pair in self.world.narrow_phase.contact_pairs().filter(pushed) {
-            for (mark, &collider) in touched.iter_mut().zip(&self.colliders) {
-                *mark |= collider == pair.collider1 || collider == pair.collider2;
+            match (drone(pair.collider1), drone(pair.collider2)) {
+                (Some(a), Some(b)) => (touches[a].drone, touches[b].drone) = (true, true),
+                (Some(a), None) | (None, Some(a)) => touches[a].ground = true,
+                (None, None) => {}
             }
         }
     }

@@ -4,7 +4,9 @@
 //! other and from the ground rapier has nothing to say beyond its own integration of a free body, so there the same
 //! arithmetic is done here: the same bits (a test holds both against each other), without the cost of its pipeline.
 
-use super::engine::{CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS, Engine, Motion, REACH, mass_properties, parameters, upright};
+use super::engine::{
+    CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS, Engine, Motion, REACH, Touch, mass_properties, parameters, upright,
+};
 use super::model::{Craft, Effects, Inputs, State};
 use magex_core::task::Downwash;
 use rapier3d::parry::query::intersection_test;
@@ -147,7 +149,7 @@ pub(crate) struct World {
     engine: Option<Box<Engine>>,
     /// Force and torque on each drone in this step.
     loads: Vec<(Vector, Vector)>,
-    touched: Vec<bool>,
+    touches: Vec<Touch>,
     /// Downwash on one drone from each other one.
     washes: Vec<f64>,
 }
@@ -159,7 +161,7 @@ impl World {
             drones,
             engine: None,
             loads: vec![(Vector::ZERO, Vector::ZERO); n],
-            touched: vec![false; n],
+            touches: vec![Touch::default(); n],
             washes: Vec::with_capacity(n),
         }
     }
@@ -167,7 +169,7 @@ impl World {
     /// One physics step with a command of the motors per drone.
     pub(crate) fn step(&mut self, laws: &Laws, rpm: &[[f64; 4]]) {
         self.find_loads(laws, rpm);
-        self.touched.fill(false);
+        self.touches.fill(Touch::default());
         let near = laws.always || self.near(laws);
         let before = self.drones.iter().map(|drone| drone.motion);
         if near {
@@ -183,7 +185,7 @@ impl World {
                 engine.load(i, force, torque);
             }
             engine.step();
-            engine.mark_contacts(&mut self.touched);
+            engine.mark_contacts(&mut self.touches);
         }
         for (i, (drone, &(force, torque))) in self.drones.iter_mut().zip(&self.loads).enumerate() {
             let before = drone.motion;
@@ -222,8 +224,7 @@ impl World {
                 self.washes.sort_unstable_by(f64::total_cmp);
                 wash = self.washes.iter().sum();
             }
-            let inputs =
-                Inputs { lagged: quaternion(drone.lagged), rpm: rpm[i], rpm_before: drone.rpm_before, wash };
+            let inputs = Inputs { lagged: quaternion(drone.lagged), rpm: rpm[i], rpm_before: drone.rpm_before, wash };
             let loads = laws.craft.loads(&drone.state(), &inputs, laws.effects);
             let vector = |v: [f64; 3]| Vector::new(v[0] as f32, v[1] as f32, v[2] as f32);
             let (force, torque) = (vector(loads.force), vector(loads.moment));
@@ -251,32 +252,24 @@ impl World {
         })
     }
 
-    /// Finds the drones that crashed in the step just done and takes them out; returns whether there are any.
-    pub(crate) fn judge(&mut self) -> bool {
+    /// Finds the drones that crashed in the step just done and takes them out.
+    pub(crate) fn judge(&mut self) {
         self.mark_overlaps();
-        let mut any = false;
-        for (drone, &touched) in self.drones.iter_mut().zip(&self.touched) {
+        for (drone, touch) in self.drones.iter_mut().zip(&self.touches) {
             if drone.fixed {
                 continue;
             }
-            let grounded = drone.clearance() <= 0.0;
+            let grounded = touch.ground || drone.clearance() <= 0.0;
             if drone.is_out() {
-                drone.rest(grounded || touched);
-                continue;
-            }
-            let foresight = 0.0005 + CLOSING / 120.0;
-            drone.crash = if grounded || (touched && drone.clearance() <= foresight) {
-                Some(Crash::Ground)
-            } else if touched {
-                Some(Crash::Contact)
+                drone.rest(grounded || touch.drone);
+            } else if grounded {
+                drone.crash = Some(Crash::Ground);
+            } else if touch.drone {
+                drone.crash = Some(Crash::Contact);
             } else if drone.upright() < 0.0 {
-                Some(Crash::Tilt)
-            } else {
-                None
-            };
-            any |= drone.is_out();
+                drone.crash = Some(Crash::Tilt);
+            }
         }
-        any
     }
 
     /// Pairs that overlap after the step, whether rapier has seen them before it or not.
@@ -291,7 +284,7 @@ impl World {
                 let (a, b) = (*a * upright(), *b * upright());
                 // Two cylinders are a supported pair; an answer that is none counts as contact.
                 if intersection_test(&a, &shape, &b, &shape).is_ok_and(|answer| answer.intersecting) {
-                    (self.touched[i], self.touched[j]) = (true, true);
+                    (self.touches[i].drone, self.touches[j].drone) = (true, true);
                 }
             }
         }

@@ -6,6 +6,7 @@
 //! controller, fed the recorded states, give the recorded rpm? Does it hold the same in closed loop?
 
 mod calls;
+mod engine;
 mod exact;
 mod forces;
 mod recording;
@@ -73,7 +74,12 @@ pub fn verify_drones(text: &str) -> Result<DroneReport, GoldenError> {
     let root = Field::root(&value);
     let format = root.get("format")?;
     match format.text()? {
-        "drone-golden-1" => Ok(exact::verify(&Trajectory::read(&root)?)),
+        "drone-golden-1" => {
+            let recording = Trajectory::read(&root)?;
+            let mut report = exact::verify(&recording);
+            engine::verify(&recording, &mut report);
+            Ok(report)
+        }
         "drone-controller-golden-1" => calls::verify(&root),
         "drone-forces-golden-1" => forces::verify(&root),
         other => Err(format.wrong(format!(
