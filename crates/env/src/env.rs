@@ -1,5 +1,6 @@
 //! What every task looks like from outside, and the list of them.
 
+use crate::drones::Drones;
 use crate::error::EnvError;
 use crate::spread::Spread;
 use magex_core::rng::Stream;
@@ -66,7 +67,8 @@ pub fn new_env(
 ) -> Result<Box<dyn Env>, EnvError> {
     Ok(match task.name {
         TaskName::SimpleSpread => Box::new(Spread::new(task, streams)?),
-        TaskName::PushBall | TaskName::Drones => {
+        TaskName::Drones => Box::new(Drones::new(task, streams)?),
+        TaskName::PushBall => {
             let _ = training;
             return Err(EnvError::Task(format!("task.name: {} is not built in", task.name)));
         }

@@ -24,6 +24,7 @@ mod physics;
 mod real;
 mod spread;
 
+pub use drones::{Drones, scripted_drones};
 pub use env::{Env, Score, View, new_env};
 pub use error::EnvError;
 pub use real::Real;

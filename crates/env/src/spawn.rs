@@ -27,8 +27,8 @@ pub fn spawn(task: &TaskConfig, stream: &mut Stream) -> Start {
     };
     match task.spawn {
         Spawn::Uniform => {
-            let agents = uniform(task.agents, task.side, stream);
-            Start { agents, landmarks: uniform(task.agents, task.side, stream) }
+            let agents = uniform(task.agents, task.side, SPACING, stream);
+            Start { agents, landmarks: uniform(task.agents, task.side, SPACING, stream) }
         }
         Spawn::Lines(fixed) => {
             let layout = pick(fixed, stream);
@@ -57,10 +57,10 @@ fn on_lines(points: &Points, scale: f64, stream: &mut Stream) -> Vec<f32> {
     flatten(all.into_iter())
 }
 
-/// n uniform points in the centred square, SPACING apart: one after the other, each drawn again while it is too close
+/// n uniform points `[n, 2]` in the centred square, `spacing` apart: one after the other, each drawn again while it is too close
 /// to an earlier one. A task that validates has room; if luck runs out all the same, the points go on a lattice.
-fn uniform(n: usize, side: f32, stream: &mut Stream) -> Vec<f32> {
-    let spacing2 = (SPACING * SPACING) as f32;
+pub(crate) fn uniform(n: usize, side: f32, spacing: f64, stream: &mut Stream) -> Vec<f32> {
+    let spacing2 = (spacing * spacing) as f32;
     let mut draw = || side * (stream.uniform32() - 0.5);
     let mut out: Vec<f32> = Vec::with_capacity(2 * n);
     for _ in 0..n {
@@ -74,17 +74,17 @@ fn uniform(n: usize, side: f32, stream: &mut Stream) -> Vec<f32> {
         });
         match free {
             Some((x, y)) => out.extend([x, y]),
-            None => return lattice(n, side, stream),
+            None => return lattice(n, side, spacing, stream),
         }
     }
     out
 }
 
 /// n points in random cells of the smallest square lattice that holds them, moved as far as the spacing allows.
-fn lattice(n: usize, side: f32, stream: &mut Stream) -> Vec<f32> {
+fn lattice(n: usize, side: f32, spacing: f64, stream: &mut Stream) -> Vec<f32> {
     let columns = (1..).find(|c| c * c >= n).unwrap_or(1);
     let cell = f64::from(side) / columns as f64;
-    let slack = (cell - SPACING).max(0.0);
+    let slack = (cell - spacing).max(0.0);
     let mut order = stream.permutation(columns * columns);
     order.truncate(n);
     let mut coordinate = |k: usize| cell * (k as f64 + 0.5) - 0.5 * f64::from(side) + slack * (stream.uniform() - 0.5);
@@ -132,7 +132,7 @@ mod tests {
             for k in 0..20 {
                 assert!(closest(&spawn(&task, &mut stream(k)).agents) >= SPACING - 1e-6, "N = {n}");
             }
-            let points = lattice(n, task.side, &mut stream(0));
+            let points = lattice(n, task.side, SPACING, &mut stream(0));
             assert_eq!(points.len(), 2 * n);
             assert!(closest(&points) >= SPACING - 1e-5, "N = {n}: {}", closest(&points));
             assert!(points.iter().all(|c| c.abs() <= task.side / 2.0));

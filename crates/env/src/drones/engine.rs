@@ -4,14 +4,14 @@ use super::model::Craft;
 use rapier3d::prelude::*;
 
 /// Radius of a drone's collision cylinder, m.
-pub const CYLINDER_RADIUS: f32 = 0.06;
+pub(crate) const CYLINDER_RADIUS: f32 = 0.06;
 /// Half its height, m; its axis is body z.
-pub const CYLINDER_HALF_HEIGHT: f32 = 0.0125;
+pub(crate) const CYLINDER_HALF_HEIGHT: f32 = 0.0125;
 /// No point of the cylinder is farther from the centre than this, m (√(0.06² + 0.0125²), rounded up).
 pub(crate) const REACH: f32 = 0.0613;
 
-/// The mass properties of a drone.
-pub(crate) fn mass_properties(craft: &Craft) -> MassProperties {
+/// The mass properties of a drone as rapier is told them.
+fn mass_properties(craft: &Craft) -> MassProperties {
     let [x, y, z] = craft.inertia;
     MassProperties::new(Vector::ZERO, craft.mass as f32, Vector::new(x as f32, y as f32, z as f32))
 }
@@ -77,11 +77,11 @@ impl Engine {
     pub(crate) fn new(
         motions: impl Iterator<Item = Motion>,
         parameters: IntegrationParameters,
-        gravity: f32,
-        properties: MassProperties,
+        craft: &Craft,
     ) -> Self {
+        let properties = mass_properties(craft);
         let mut world = PhysicsWorld::new();
-        world.gravity = Vector::new(0.0, 0.0, -gravity);
+        world.gravity = Vector::new(0.0, 0.0, -(craft.gravity as f32));
         world.integration_parameters = parameters;
         world.insert_collider(ColliderBuilder::new(SharedShape::halfspace(Vector::Z)), None);
         let (mut bodies, mut colliders) = (Vec::new(), Vec::new());
@@ -100,6 +100,19 @@ impl Engine {
             colliders.push(collider);
         }
         Self { world, bodies, colliders }
+    }
+
+    /// The mass properties of a drone as rapier uses them: it finds the principal axes itself, and another order or sign
+    /// of them gives other roundings.
+    pub(crate) fn properties(craft: &Craft, parameters: IntegrationParameters) -> MassProperties {
+        let alone = Motion {
+            pose: Pose::from_parts(Vector::new(0.0, 0.0, 10.0), Rotation::IDENTITY),
+            linvel: Vector::ZERO,
+            angvel: Vector::ZERO,
+        };
+        let mut engine = Self::new(std::iter::once(alone), parameters, craft);
+        engine.step();
+        engine.world.bodies[engine.bodies[0]].mass_properties().local_mprops
     }
 
     /// Moves a drone, if it is not there already.

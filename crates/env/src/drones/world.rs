@@ -5,7 +5,7 @@
 //! arithmetic is done here: the same bits (a test holds both against each other), without the cost of its pipeline.
 
 use super::engine::{
-    CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS, Engine, Motion, REACH, Touch, mass_properties, parameters, upright,
+    CYLINDER_HALF_HEIGHT, CYLINDER_RADIUS, Engine, Motion, REACH, Touch, parameters, upright,
 };
 use super::model::{Craft, Effects, Inputs, State};
 use magex_core::task::Downwash;
@@ -122,14 +122,15 @@ pub(crate) struct Laws {
 impl Laws {
     pub(crate) fn new(craft: Craft, effects: Effects, downwash: Downwash, dt: f64) -> Self {
         let dt32 = dt as f32;
+        let parameters = parameters(dt32, CLOSING * dt32, craft.most_speed as f32);
         Self {
             craft,
             effects: Effects { downwash: effects.downwash && downwash != Downwash::Off, ..effects },
             downwash,
             dt,
             always: false,
-            properties: mass_properties(&craft),
-            parameters: parameters(dt32, CLOSING * dt32, craft.most_speed as f32),
+            properties: Engine::properties(&craft, parameters),
+            parameters,
         }
     }
 
@@ -174,7 +175,7 @@ impl World {
         let before = self.drones.iter().map(|drone| drone.motion);
         if near {
             let engine = self.engine.get_or_insert_with(|| {
-                let engine = Engine::new(before, laws.parameters, laws.craft.gravity as f32, laws.properties);
+                let engine = Engine::new(before, laws.parameters, &laws.craft);
                 Box::new(engine)
             });
             for (i, (drone, &(force, torque))) in self.drones.iter().zip(&self.loads).enumerate() {
