@@ -1,4 +1,4 @@
-//! Joint steps per second of one core, for the sizes of the paper and larger ones.
+//! Joint steps per second of one core, for the sizes of the paper and larger ones; commands per second of the drones.
 //!
 //! `cargo run --release -p magex-env --example throughput [seconds per size]`
 
@@ -19,6 +19,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         } else {
             println!("{agents:>6} {worlds:>8} {all:>16.0}");
         }
+    }
+    println!("{:>6} {:>8} {:>22} {:>22}", "drones", "episodes", "commands/s, random", "piloted");
+    for (drones, episodes) in [(1, 64), (2, 64), (4, 64), (8, 32)] {
+        let random = magex_env::bench::drone_throughput(drones, episodes, false, seconds)?;
+        let piloted = magex_env::bench::drone_throughput(drones, episodes, true, seconds)?;
+        println!("{drones:>6} {episodes:>8} {random:>22.0} {piloted:>22.0}");
     }
     Ok(())
 }

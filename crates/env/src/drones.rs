@@ -221,7 +221,8 @@ impl Env for Drones {
         }
         self.steps += 1;
         let n = self.agents;
-        let inputs = actions.chunks_exact(3 * n).zip(self.goals.chunks_exact(n)).zip(self.landmarks.chunks_exact(3 * n));
+        let inputs =
+            actions.chunks_exact(3 * n).zip(self.goals.chunks_exact(n)).zip(self.landmarks.chunks_exact(3 * n));
         let outputs = self.episodes.iter_mut().zip(rewards.chunks_exact_mut(n));
         for ((episode, rewards), ((actions, goals), landmarks)) in outputs.zip(inputs) {
             episode.prepare(goals, landmarks);

@@ -81,8 +81,7 @@ impl Episode {
                     [0.0; 4]
                 } else {
                     let state = drone.state();
-                    let request =
-                        Request::velocity(state.position, state.attitude, state.velocity, self.targets[i]);
+                    let request = Request::velocity(state.position, state.attitude, state.velocity, self.targets[i]);
                     self.memories[i].call(&laws.craft, &Gains::CF2X, &request, laws.dt).rpm
                 };
             }
@@ -114,8 +113,7 @@ impl Episode {
             let crashed = self.world.drones[i].is_out();
             let distance = self.distance(i, goals, landmarks);
             let others = (0..self.world.drones.len()).filter(|&j| j != i && !self.world.drones[j].is_out());
-            let nearest =
-                others.map(|j| norm(sub(self.place(i), self.place(j)))).fold(f64::INFINITY, f64::min);
+            let nearest = others.map(|j| norm(sub(self.place(i), self.place(j)))).fold(f64::INFINITY, f64::min);
             let closeness = (1.0 - nearest / f64::from(config.proximity_radius)).max(0.0);
             let mut sum = f64::from(config.progress) * (self.before[i] - distance);
             sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };

@@ -29,7 +29,7 @@ const SMALL_TURN: f64 = 0.06;
 fn world(recording: &Trajectory, t: usize) -> World {
     let drones = (0..recording.drones).map(|i| {
         let mut drone = Drone::at(&recording.frames[t][i]);
-        drone.lagged = Drone::at(&State { attitude: recording.lagged(t, i), ..recording.frames[t][i] }).lagged;
+        drone.remember(recording.lagged(t, i));
         drone.rpm_before = recording.rpm_before(t, i);
         drone
     });

@@ -70,7 +70,6 @@ fn constants_of_the_file_count() {
         ("mass_kg", 1.001),
         ("gravity_m_s2", 1.001),
         ("kf_N_per_rpm2", 1.001),
-        ("km_Nm_per_rpm2", 1.01),
         ("prop_radius_m", 1.01),
         ("gnd_eff_coeff", 1.01),
         ("drag_coeff_xy", 1.1),
@@ -87,6 +86,8 @@ fn constants_of_the_file_count() {
         assert!(!verify(&value).unwrap().agrees(), "{name}");
     }
     let mut value = short("cl_vel_120_120.json", 20);
+    value["meta"]["constants"]["km_Nm_per_rpm2"] = 8e-12.into();
+    assert!(!verify(&value).unwrap().agrees());
     value["meta"]["constants"]["pid"]["D_for"][0] = 0.201.into();
     assert!(verify(&value).unwrap().disagreements().iter().any(|words| words.contains("controller rpm")));
 }
@@ -134,7 +135,9 @@ fn every_missing_or_malformed_field_is_named() {
         ("pos[1]", |value| value["pos"][1] = json!([])),
         ("quat[2][0]", |value| value["quat"][2][0] = json!([0.0, 0.0, 0.0, 2.0])),
         ("rpm[0][0][3]", |value| value["rpm"][0][0][3] = "fast".into()),
-        ("meta.constants.inertia_diag_kg_m2[1]", |value| value["meta"]["constants"]["inertia_diag_kg_m2"][1] = 0.0.into()),
+        ("meta.constants.inertia_diag_kg_m2[1]", |value| {
+            value["meta"]["constants"]["inertia_diag_kg_m2"][1] = 0.0.into()
+        }),
         ("meta.constants.pid.pwm_max", |value| value["meta"]["constants"]["pid"]["pwm_max"] = 1.0.into()),
     ];
     for (field, edit) in broken {
