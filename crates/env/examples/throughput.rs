@@ -1,4 +1,4 @@
-//! Joint steps per second of one core, for the sizes of the paper and larger ones.
+//! Joint steps per second of one core, for the sizes of the paper and larger ones; commands per second of the drones.
 //!
 //! `cargo run --release -p magex-env --example throughput [seconds per size]`
 
@@ -28,6 +28,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (agents, worlds) in [(5, 256), (20, 64), (50, 32), (100, 16), (200, 16), (1000, 1)] {
         let task = TaskConfig::of(TaskName::PushBall, agents, Spawn::Uniform);
         println!("{agents:>6} {worlds:>8} {:>16.0}", magex_env::bench::throughput_of(&task, worlds, seconds)?);
+    }
+    println!("{:>6} {:>8} {:>22} {:>22}", "drones", "episodes", "commands/s, random", "piloted");
+    for (drones, episodes) in [(1, 64), (2, 64), (4, 64), (8, 32)] {
+        let random = magex_env::bench::drone_throughput(drones, episodes, false, seconds)?;
+        let piloted = magex_env::bench::drone_throughput(drones, episodes, true, seconds)?;
+        println!("{drones:>6} {episodes:>8} {random:>22.0} {piloted:>22.0}");
     }
     Ok(())
 }

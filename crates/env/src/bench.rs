@@ -1,12 +1,13 @@
 //! How fast the environment runs. The only part of the crate that looks at a clock; nothing else depends on it.
 
 use crate::batch::Batch;
-use crate::env::{Env as _, new_env};
+use crate::drones::{Drones, scripted_drones};
+use crate::env::{Env as _, View, new_env};
 use crate::error::EnvError;
 use crate::real::Real;
 use crate::spread::{LANES, Spread};
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{DroneConfig, Spawn, TaskConfig, TaskName};
 use std::time::Instant;
 
 /// Joint steps in the table of random actions.
@@ -40,6 +41,49 @@ pub fn throughput_of(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f
             }
         }
         std::hint::black_box(env.scores());
+        round += 1;
+    }
+}
+
+/// Commands per second of one core of the drone task: `episodes` episodes of N drones flown by the scripted pilot (`piloted`) or at
+/// random, spawned anew and scored at every horizon; controllers, physics, contacts and rewards included. Runs for about
+/// `seconds`.
+pub fn drone_throughput(agents: usize, episodes: usize, piloted: bool, seconds: f64) -> Result<f64, EnvError> {
+    let task = TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform);
+    let numbers = agents * episodes;
+    let mut stream = Key::new(1, Purpose::Bench, &[4]).stream();
+    let table: Vec<Vec<u8>> = (0..TABLE).map(|_| (0..3 * numbers).map(|_| stream.below(3) as u8).collect()).collect();
+    let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..agents as u32).collect();
+    let (mut positions, mut extras) = (vec![0.0; 3 * numbers], vec![0.0; DroneConfig::EXTRAS * numbers]);
+    let (mut actions, mut rewards) = (vec![1; 3 * numbers], vec![0.0; numbers]);
+    let (start, mut commands, mut round) = (Instant::now(), 0u64, 0);
+    loop {
+        let streams = (0..episodes as u32).map(|episode| Key::new(1, Purpose::Bench, &[3, round, episode]).stream());
+        let mut drones = Drones::new(&task, streams)?;
+        drones.set_goals(&goals)?;
+        let landmarks = drones.landmarks().to_vec();
+        for step in 0..task.horizon as usize {
+            if piloted {
+                drones.write_positions(&mut positions)?;
+                drones.write_extras(&mut extras)?;
+                let view = View {
+                    positions: &positions,
+                    velocities: &positions,
+                    extras: &extras,
+                    landmarks: &landmarks,
+                    goals: &goals,
+                };
+                scripted_drones(&view, agents, &mut actions)?;
+            } else {
+                actions.copy_from_slice(&table[step % TABLE]);
+            }
+            drones.step(&actions, &mut rewards)?;
+            commands += episodes as u64;
+            if step % 8 == 0 && start.elapsed().as_secs_f64() >= seconds {
+                return Ok(commands as f64 / start.elapsed().as_secs_f64());
+            }
+        }
+        std::hint::black_box(drones.scores());
         round += 1;
     }
 }

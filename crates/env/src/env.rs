@@ -1,5 +1,6 @@
 //! What every task looks like from outside, and the list of them.
 
+use crate::drones::Drones;
 use crate::error::EnvError;
 use crate::push_ball::PushBall;
 use crate::spread::Spread;
@@ -68,9 +69,7 @@ pub fn new_env(
     Ok(match task.name {
         TaskName::SimpleSpread => Box::new(Spread::new(task, streams)?),
         TaskName::PushBall => Box::new(PushBall::new(task, streams, training)?),
-        TaskName::Drones => {
-            return Err(EnvError::Task(format!("task.name: {} is not built in", task.name)));
-        }
+        TaskName::Drones => Box::new(Drones::new(task, streams)?),
     })
 }
 

@@ -25,6 +25,14 @@ pub enum EnvError {
         /// The value found there.
         action: u8,
     },
+    /// An action component does not exist.
+    #[error("actions[{place}]: {action} is not an action; use 0 forward, 1 stop, 2 backward")]
+    AxisAction {
+        /// Flat index into `[B, N, H]`.
+        place: usize,
+        /// The value found there.
+        action: u8,
+    },
     /// A goal names a landmark that does not exist.
     #[error("goals[{place}]: {goal} is not a landmark; use an index below {landmarks}")]
     Goal {

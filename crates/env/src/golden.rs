@@ -1,10 +1,12 @@
-//! Agreement with recordings of the authors' simulator (format `mpe-golden-1`).
+//! Agreement with recordings of the authors' simulator (format `mpe-golden-1`), and of a drone simulator ([`drones`]).
 //!
 //! A recording holds the bodies, the constants, the initial state, the actions and every following state in f64, with
 //! the reward, the success rate and the overlaps the authors' code computed. Three questions are asked of it:
 //! does one step from every recorded state lead to the next one (insensitive to chaos); does a whole run from the
 //! initial state stay with the recorded one for as long as the system is well conditioned; and do the authors' own
 //! formulas, defects included, give the recorded reward and success.
+
+pub mod drones;
 
 mod reader;
 mod recording;

@@ -8,6 +8,7 @@
 //! No networks, no threads, no clock (except in [`mod@bench`], which measures).
 
 pub mod bench;
+pub mod drones;
 pub mod golden;
 pub mod layouts;
 pub mod push_ball;
@@ -25,6 +26,7 @@ mod real;
 mod spread;
 mod swarm;
 
+pub use drones::{Drones, scripted_drones};
 pub use env::{Env, Score, View, new_env};
 pub use error::EnvError;
 pub use push_ball::PushBall;

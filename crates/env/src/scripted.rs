@@ -2,6 +2,7 @@
 
 mod push_ball;
 
+use crate::drones::scripted_drones;
 use crate::env::View;
 use crate::error::{EnvError, check_len};
 use crate::physics::Physics;
@@ -13,9 +14,8 @@ pub fn scripted(task: &TaskConfig, view: &View<'_>, out: &mut [u8]) -> Result<()
         TaskName::SimpleSpread => {
             scripted_actions(view.positions, view.velocities, view.landmarks, view.goals, task.agents, out)
         }
-        TaskName::PushBall | TaskName::Drones => {
-            Err(EnvError::Task(format!("task.name: {} has no scripted controller", task.name)))
-        }
+        TaskName::PushBall => scripted_push_ball(view, task.agents, out),
+        TaskName::Drones => scripted_drones(view, task.agents, out),
     }
 }
 

@@ -27,8 +27,8 @@ pub fn spawn(task: &TaskConfig, stream: &mut Stream) -> Start {
     };
     match task.spawn {
         Spawn::Uniform => {
-            let agents = uniform(task.agents, task.side, stream);
-            Start { agents, landmarks: uniform(task.agents, task.side, stream) }
+            let agents = uniform(task.agents, task.side, SPACING, stream);
+            Start { agents, landmarks: uniform(task.agents, task.side, SPACING, stream) }
         }
         Spawn::Lines(fixed) => {
             let layout = pick(fixed, stream);
@@ -57,10 +57,10 @@ fn on_lines(points: &Points, scale: f64, stream: &mut Stream) -> Vec<f32> {
     flatten(all.into_iter())
 }
 
-/// n uniform points in the centred square, SPACING apart. A task that validates has room; if luck runs out all the same,
-/// the points go on a lattice.
-fn uniform(n: usize, side: f32, stream: &mut Stream) -> Vec<f32> {
-    scatter(n, side, SPACING, None, stream).unwrap_or_else(|| lattice(n, side, SPACING, stream))
+/// n uniform points `[n, 2]` in the centred square, `spacing` apart. A task that validates has room; if luck runs out all the
+/// same, the points go on a lattice.
+pub(crate) fn uniform(n: usize, side: f32, spacing: f64, stream: &mut Stream) -> Vec<f32> {
+    scatter(n, side, spacing, None, stream).unwrap_or_else(|| lattice(n, side, spacing, stream))
 }
 
 /// n uniform points in the centred square, `spacing` apart and as far as asked from the points to `avoid` `[M, 2]`: one after

@@ -73,6 +73,15 @@ impl<'a> Field<'a> {
         Ok(list.iter().enumerate().map(move |(k, value)| Field { path: format!("{path}[{k}]"), value }))
     }
 
+    /// The elements of a list of at most `most`.
+    pub(super) fn items(&self, most: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, GoldenError> {
+        let len = self.value.as_array().ok_or_else(|| self.wrong("must be a list"))?.len();
+        if len > most {
+            return Err(self.wrong(format!("has {len} entries, at most {most} are supported")));
+        }
+        self.list(len)
+    }
+
     /// Every element of a list of known length, read.
     pub(super) fn each<T>(
         &self,

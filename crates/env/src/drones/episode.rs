@@ -1,0 +1,195 @@
+//! One episode of the drone task: commands, controllers, crashes, reward, score.
+
+use super::control::{Gains, Memory, Request};
+use super::linalg::{V3, norm, scale, sub};
+use super::model::State;
+use super::world::{Drone, Laws, World};
+use super::{ACCELERATION, COVER_RADIUS, MOST_SPEED};
+use crate::env::Score;
+use crate::matching::maximum_matching;
+use magex_core::task::DroneConfig;
+
+/// An episode.
+pub(super) struct Episode {
+    pub(super) world: World,
+    memories: Vec<Memory>,
+    /// Target velocities, m/s.
+    targets: Vec<V3>,
+    /// Distance of each drone to its landmark before the command, m; meaningless before the first one.
+    before: Vec<f64>,
+    /// Whether each drone was out before the command.
+    was_out: Vec<bool>,
+    rpm: Vec<[f64; 4]>,
+    /// Share of landmarks covered before the first command.
+    spawn_success: f32,
+    /// First command after which the landmarks were covered, 0 while it has not happened.
+    arrival: u32,
+    /// Sum of the rewards of all drones.
+    reward: f64,
+}
+
+fn vector(values: &[f32]) -> V3 {
+    std::array::from_fn(|d| f64::from(values[d]))
+}
+
+impl Episode {
+    /// Level drones; `positions`, `velocities` and `landmarks` are `[N, 3]`.
+    pub(super) fn new(positions: &[f32], velocities: &[f32], landmarks: &[f32]) -> Self {
+        let state = |(position, velocity): (&[f32], &[f32])| State {
+            position: vector(position),
+            attitude: [0.0, 0.0, 0.0, 1.0],
+            velocity: vector(velocity),
+            spin: [0.0; 3],
+        };
+        let starts = positions.chunks_exact(3).zip(velocities.chunks_exact(3));
+        let drones: Vec<Drone> = starts.map(|start| Drone::at(&state(start))).collect();
+        let n = drones.len();
+        let mut episode = Self {
+            world: World::new(drones),
+            memories: vec![Memory::default(); n],
+            targets: velocities.chunks_exact(3).map(|v| limited(vector(v))).collect(),
+            before: vec![0.0; n],
+            was_out: vec![false; n],
+            rpm: vec![[0.0; 4]; n],
+            spawn_success: 0.0,
+            arrival: 0,
+            reward: 0.0,
+        };
+        episode.spawn_success = share(covered(&episode.near(landmarks)), n);
+        episode
+    }
+
+    /// Distance of a drone to its landmark, m.
+    fn distance(&self, i: usize, goals: &[u32], landmarks: &[f32]) -> f64 {
+        let goal = goals[i] as usize;
+        norm(sub(self.place(i), vector(&landmarks[3 * goal..3 * goal + 3])))
+    }
+
+    fn place(&self, i: usize) -> V3 {
+        self.world.drones[i].motion.pose.translation.to_array().map(f64::from)
+    }
+
+    /// Executes a command: `actions` is `[N, 3]`, held for `hold` physics steps.
+    pub(super) fn fly(&mut self, laws: &Laws, hold: u32, actions: &[u8]) {
+        const CHANGE: f64 = ACCELERATION / DroneConfig::COMMANDS_HZ as f64;
+        for (target, actions) in self.targets.iter_mut().zip(actions.chunks_exact(3)) {
+            *target = limited(std::array::from_fn(|d| target[d] + CHANGE * (1.0 - f64::from(actions[d]))));
+        }
+        for _ in 0..hold {
+            for (i, drone) in self.world.drones.iter().enumerate() {
+                self.rpm[i] = if drone.is_out() {
+                    [0.0; 4]
+                } else {
+                    let state = drone.state();
+                    let request = Request::velocity(state.position, state.attitude, state.velocity, self.targets[i]);
+                    self.memories[i].call(&laws.craft, &Gains::CF2X, &request, laws.dt).rpm
+                };
+            }
+            self.world.step(laws, &self.rpm);
+            self.world.judge();
+        }
+        for (target, drone) in self.targets.iter_mut().zip(&self.world.drones) {
+            if drone.is_out() {
+                *target = [0.0; 3];
+            }
+        }
+    }
+
+    /// Notes what the reward of the command to come compares with.
+    pub(super) fn prepare(&mut self, goals: &[u32], landmarks: &[f32]) {
+        for i in 0..goals.len() {
+            self.before[i] = self.distance(i, goals, landmarks);
+            self.was_out[i] = self.world.drones[i].is_out();
+        }
+    }
+
+    /// Rewards of the command just executed, `[N]`.
+    pub(super) fn pay(&mut self, config: &DroneConfig, goals: &[u32], landmarks: &[f32], rewards: &mut [f32]) {
+        for (i, reward) in rewards.iter_mut().enumerate() {
+            *reward = 0.0;
+            if self.was_out[i] {
+                continue;
+            }
+            let crashed = self.world.drones[i].is_out();
+            let distance = self.distance(i, goals, landmarks);
+            let others = (0..self.world.drones.len()).filter(|&j| j != i && !self.world.drones[j].is_out());
+            let nearest = others.map(|j| norm(sub(self.place(i), self.place(j)))).fold(f64::INFINITY, f64::min);
+            let closeness = (1.0 - nearest / f64::from(config.proximity_radius)).max(0.0);
+            let mut sum = f64::from(config.progress) * (self.before[i] - distance);
+            sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };
+            sum -= if crashed { f64::from(config.crash) } else { 0.0 };
+            sum -= f64::from(config.proximity) * closeness;
+            *reward = sum as f32;
+            self.reward += sum;
+        }
+    }
+
+    /// Looks at the landmarks after command number `step` (from 1).
+    pub(super) fn observe(&mut self, step: u32, landmarks: &[f32]) {
+        let n = self.world.drones.len();
+        if self.arrival == 0 && covered(&self.near(landmarks)) + n / 100 >= n {
+            self.arrival = step;
+        }
+    }
+
+    /// The drones that are not out within reach of each landmark.
+    fn near(&self, landmarks: &[f32]) -> Vec<Vec<u32>> {
+        let within = |landmark: V3, i: usize| norm(sub(self.place(i), landmark)) <= COVER_RADIUS;
+        let flying = |i: &usize| !self.world.drones[*i].is_out();
+        let near = |landmark: &[f32]| -> Vec<u32> {
+            let landmark = vector(landmark);
+            let drones = (0..self.world.drones.len()).filter(flying).filter(|&i| within(landmark, i));
+            drones.map(|i| i as u32).collect()
+        };
+        landmarks.chunks_exact(3).map(near).collect()
+    }
+
+    /// `[N, 6]`: see [`super::Drones`].
+    pub(super) fn extras(&self) -> impl Iterator<Item = [f32; DroneConfig::EXTRAS]> + '_ {
+        self.world.drones.iter().zip(&self.targets).map(|(drone, target)| {
+            let [vx, vy, vz] = target.map(|c| c as f32);
+            let r = drone.motion.pose.rotation;
+            let (up_x, up_y) = (2.0 * (r.x * r.z + r.w * r.y), 2.0 * (r.y * r.z - r.w * r.x));
+            [vx, vy, vz, up_x, up_y, if drone.is_out() { 1.0 } else { 0.0 }]
+        })
+    }
+
+    /// The score after `steps` commands of an episode of `horizon`.
+    pub(super) fn score(&self, steps: u32, horizon: u32, landmarks: &[f32]) -> Score {
+        let n = self.world.drones.len();
+        let near = self.near(landmarks);
+        let commands = f64::from(steps.max(1));
+        let crashed = self.world.drones.iter().filter(|drone| drone.is_out()).count() as f64 / n as f64;
+        Score {
+            success: share(covered(&near), n),
+            matched_success: share(maximum_matching(&near, n), n),
+            spawn_success: self.spawn_success,
+            arrival_step: if self.arrival > 0 { self.arrival } else { horizon + 1 },
+            collisions_per_agent_step: (crashed / commands) as f32,
+            collision_rate: crashed as f32,
+            reward: (self.reward / (commands * n as f64)) as f32,
+        }
+    }
+}
+
+#[cfg(test)]
+impl Episode {
+    /// Makes a command no number.
+    pub(super) fn spoil(&mut self, drone: usize) {
+        self.targets[drone][0] = f64::NAN;
+    }
+}
+
+/// A target velocity of at most 2 m/s.
+fn limited(velocity: V3) -> V3 {
+    let speed = norm(velocity);
+    if speed > MOST_SPEED { scale(velocity, MOST_SPEED / speed) } else { velocity }
+}
+
+fn covered(near: &[Vec<u32>]) -> usize {
+    near.iter().filter(|drones| !drones.is_empty()).count()
+}
+
+fn share(count: usize, of: usize) -> f32 {
+    (count as f64 / of as f64) as f32
+}

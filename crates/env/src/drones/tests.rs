@@ -1,0 +1,483 @@
+use super::model::State;
+use super::world::{Crash, Drone, World};
+use super::*;
+use crate::env::View;
+use magex_core::rng::{Key, Purpose};
+use magex_core::task::{Downwash, Spawn};
+use proptest::prelude::*;
+
+fn task(agents: usize) -> TaskConfig {
+    TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform)
+}
+
+fn stream(k: u32) -> Stream {
+    Key::new(5, Purpose::Spawn, &[k]).stream()
+}
+
+/// One episode from a state, goals 0, 1, ...
+fn episode(task: &TaskConfig, positions: &[[f32; 3]], velocities: &[[f32; 3]]) -> Drones {
+    let landmarks: Vec<f32> = (0..positions.len()).flat_map(|k| [k as f32, 3.0, 1.5]).collect();
+    let mut drones = Drones::from_state(task, positions.as_flattened(), velocities.as_flattened(), &landmarks).unwrap();
+    let goals: Vec<u32> = (0..positions.len() as u32).collect();
+    drones.set_goals(&goals).unwrap();
+    drones
+}
+
+/// Everything that is seen after a step.
+#[derive(Debug, Clone, PartialEq)]
+struct Seen {
+    positions: Vec<f32>,
+    velocities: Vec<f32>,
+    extras: Vec<f32>,
+    rewards: Vec<f32>,
+}
+
+impl Seen {
+    fn bits(&self) -> Vec<u32> {
+        let all = [&self.positions, &self.velocities, &self.extras, &self.rewards];
+        all.into_iter().flatten().map(|value| value.to_bits()).collect()
+    }
+
+    fn finite(&self) -> bool {
+        [&self.positions, &self.velocities, &self.extras, &self.rewards].into_iter().flatten().all(|v| v.is_finite())
+    }
+}
+
+fn step(drones: &mut Drones, actions: &[u8]) -> Seen {
+    let numbers = drones.numbers();
+    let mut seen = Seen {
+        positions: vec![0.0; 3 * numbers],
+        velocities: vec![0.0; 3 * numbers],
+        extras: vec![0.0; 6 * numbers],
+        rewards: vec![0.0; numbers],
+    };
+    drones.step(actions, &mut seen.rewards).unwrap();
+    drones.write_positions(&mut seen.positions).unwrap();
+    drones.write_velocities(&mut seen.velocities).unwrap();
+    drones.write_extras(&mut seen.extras).unwrap();
+    seen
+}
+
+fn crash(drones: &Drones, drone: usize) -> Option<Crash> {
+    drones.episodes[0].world.drones[drone].crash
+}
+
+const STOP: [u8; 3] = [1, 1, 1];
+
+#[test]
+fn a_drone_hovers_where_it_starts() {
+    let mut drones = episode(&task(1), &[[0.2, -0.3, 1.5]], &[[0.0; 3]]);
+    let seen = (0..120).map(|_| step(&mut drones, &STOP)).last().unwrap();
+    // The engine's damping and the ground effect are small forces that a controller without an integral leaves standing.
+    for (ours, start) in seen.positions.iter().zip([0.2, -0.3, 1.5]) {
+        assert!((ours - start).abs() < 0.03, "{seen:?}");
+    }
+    assert_eq!(crash(&drones, 0), None);
+}
+
+#[test]
+fn actions_move_the_target_velocity_and_the_drone_follows() {
+    let mut drones = episode(&task(1), &[[0.0, 0.0, 1.5]], &[[0.0; 3]]);
+    let seen = step(&mut drones, &[0, 1, 2]);
+    let change = 5.0 / 30.0;
+    for (target, expected) in seen.extras.iter().zip([change, 0.0, -change]) {
+        assert!((target - expected).abs() < 1e-6, "{seen:?}");
+    }
+    // Twelve commands to full speed, and never beyond 2 m/s in all.
+    let seen = (0..30).map(|_| step(&mut drones, &[0, 0, 1])).last().unwrap();
+    let speed = |v: &[f32]| libm::sqrtf(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+    assert!((speed(&seen.extras[..3]) - 2.0).abs() < 1e-5, "{seen:?}");
+    // The drag leaves a standing error.
+    assert!((speed(&seen.velocities) - 2.0).abs() < 0.15, "{seen:?}");
+    assert!(seen.velocities[0] > 1.0 && seen.velocities[1] > 1.0, "{seen:?}");
+}
+
+/// Flies `episodes` random episodes by the scripted pilot; mean success and collision rate.
+fn scripted(task: &TaskConfig, episodes: u32) -> (f32, f32) {
+    let mut drones = Drones::new(task, (0..episodes).map(stream)).unwrap();
+    let n = task.agents;
+    let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..n as u32).collect();
+    drones.set_goals(&goals).unwrap();
+    let numbers = drones.numbers();
+    let landmarks = drones.landmarks().to_vec();
+    let (mut positions, mut velocities) = (vec![0.0; 3 * numbers], vec![0.0; 3 * numbers]);
+    let (mut extras, mut actions) = (vec![0.0; 6 * numbers], vec![1; 3 * numbers]);
+    for _ in 0..task.horizon {
+        drones.write_positions(&mut positions).unwrap();
+        drones.write_velocities(&mut velocities).unwrap();
+        drones.write_extras(&mut extras).unwrap();
+        let view = View {
+            positions: &positions,
+            velocities: &velocities,
+            extras: &extras,
+            landmarks: &landmarks,
+            goals: &goals,
+        };
+        scripted_drones(&view, n, &mut actions).unwrap();
+        drones.step(&actions, &mut vec![0.0; numbers]).unwrap();
+    }
+    let scores = drones.scores();
+    let mean = |of: fn(&Score) -> f32| scores.iter().map(of).sum::<f32>() / scores.len() as f32;
+    (mean(|score| score.success), mean(|score| score.collision_rate))
+}
+
+#[test]
+fn the_scripted_pilot_arrives_and_alone_never_crashes() {
+    assert_eq!(scripted(&task(1), 200), (1.0, 0.0));
+    for n in [2, 4] {
+        let (success, collisions) = scripted(&task(n), 200);
+        println!("N = {n}: success {success}, collisions {collisions}");
+        // It does not look out for others: who does not arrive has crashed, or lost its landmark to a crash.
+        assert!(success > 0.5 && success + collisions >= 0.95, "{n}: {success} {collisions}");
+    }
+}
+
+#[test]
+fn the_reference_downwash_forbids_coplanar_flight() {
+    let weights = |above: f64, aside: f64| -Craft::CF2X.downwash(above, aside) / Craft::CF2X.weight();
+    println!("weights: {:.1} {:.1} {:.1}", weights(5e-3, 0.3), weights(5e-3, 0.5), weights(1e-3, 0.5));
+    assert!(weights(5e-3, 0.3) > 200.0 && weights(1e-3, 0.5) > 5.0);
+    let results = [Downwash::Reference, Downwash::Limited, Downwash::Off].map(|downwash| {
+        let mut task = task(4);
+        task.drones.downwash = downwash;
+        let result = scripted(&task, 200);
+        println!("{downwash:?}: success and collision rate of the scripted pilot, N = 4: {result:?}");
+        result.0
+    });
+    let [reference, limited, off] = results;
+    assert!(reference < limited - 0.1 && limited < off + 0.05, "{results:?}");
+}
+
+#[test]
+fn random_flight_is_measured() {
+    let mut drones = Drones::new(&task(4), (0..50).map(stream)).unwrap();
+    drones.set_goals(&[0, 1, 2, 3].repeat(50)).unwrap();
+    let mut random = Key::new(3, Purpose::Action, &[]).stream();
+    for _ in 0..120 {
+        let actions: Vec<u8> = (0..600).map(|_| random.below(3) as u8).collect();
+        assert!(step(&mut drones, &actions).finite());
+    }
+    let mut crashes = std::collections::BTreeMap::<_, u32>::new();
+    for drone in drones.episodes.iter().flat_map(|episode| &episode.world.drones) {
+        *crashes.entry(format!("{:?}", drone.crash)).or_default() += 1;
+    }
+    println!("200 drones, random actions: {crashes:?}");
+}
+
+fn random_actions(n: usize) -> impl Strategy<Value = Vec<Vec<u8>>> {
+    prop::collection::vec(prop::collection::vec(0..3u8, 3 * n), 1..40)
+}
+
+/// Positions in a small box (many meetings), velocities up to 2 m/s, and actions.
+fn cases() -> impl Strategy<Value = (Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<Vec<u8>>)> {
+    (1..5usize).prop_flat_map(|n| {
+        let position = [-0.4..0.4f32, -0.4..0.4f32, 0.1..0.5f32];
+        let velocity = [-1.2..1.2f32, -1.2..1.2f32, -1.2..1.2f32];
+        (prop::collection::vec(position, n), prop::collection::vec(velocity, n), random_actions(n))
+    })
+}
+
+fn apart(positions: &[[f32; 3]], least: f32) -> bool {
+    let near = |a: &[f32; 3], b: &[f32; 3]| (0..3).map(|d| (a[d] - b[d]).powi(2)).sum::<f32>() < least * least;
+    positions.iter().enumerate().all(|(k, a)| positions[..k].iter().all(|b| !near(a, b)))
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn rapier_and_the_free_step_give_the_same_bits((positions, velocities, actions) in cases()) {
+        prop_assume!(apart(&positions, 0.14));
+        let task = task(positions.len());
+        let mut lazy = episode(&task, &positions, &velocities);
+        let mut always = episode(&task, &positions, &velocities);
+        always.laws.always = true;
+        for (k, actions) in actions.iter().enumerate() {
+            let (a, b) = (step(&mut lazy, actions), step(&mut always, actions));
+            prop_assert!(a.finite() && b.finite());
+            for i in 0..positions.len() {
+                prop_assert_eq!(crash(&lazy, i), crash(&always, i), "command {} drone {}", k, i);
+            }
+            // A contact's impulses depend on what rapier remembers of the pair.
+            if lazy.scores()[0].collision_rate > 0.0 {
+                break;
+            }
+            prop_assert_eq!(a.bits(), b.bits(), "command {}: {:?} {:?}", k, a, b);
+        }
+    }
+}
+
+/// No gravity, no damping, no effects: what is left is rapier.
+fn vacuum(dt: f64) -> Laws {
+    let craft = Craft { gravity: 0.0, linear_damping: 0.0, angular_damping: 0.0, ..Craft::CF2X };
+    Laws::new(craft, Effects::default(), Downwash::Off, dt)
+}
+
+fn state(position: [f64; 3], velocity: [f64; 3]) -> State {
+    State { position, attitude: [0.0, 0.0, 0.0, 1.0], velocity, spin: [0.0; 3] }
+}
+
+#[test]
+fn a_head_on_collision_keeps_momentum_and_is_seen_in_its_step() {
+    for (speed, hz) in [(0.5, 120.0), (1.0, 120.0), (2.0, 120.0), (2.0, 240.0), (1.37, 480.0)] {
+        let laws = vacuum(1.0 / hz);
+        let start = [state([-0.3, 0.01, 1.5], [speed, 0.0, 0.0]), state([0.3, -0.01, 1.5], [-speed, 0.0, 0.0])];
+        let mut world = World::new(start.iter().map(Drone::at).collect());
+        let mut seen = false;
+        for _ in 0..(0.4 / speed * hz) as usize {
+            let gap = |world: &World| {
+                let d = world.drones[0].motion.pose.translation - world.drones[1].motion.pose.translation;
+                libm::sqrtf(d.x * d.x + d.y * d.y) - 0.12
+            };
+            let before = gap(&world);
+            world.step(&laws, &[[0.0; 4]; 2]);
+            world.judge();
+            // The step in which they would have met, had nothing held them.
+            let meet = before - 2.0 * (speed / hz) as f32 <= 0.0;
+            let crashed = world.drones[0].crash == Some(Crash::Contact);
+            assert_eq!(world.drones[0].crash, world.drones[1].crash);
+            if !seen && crashed {
+                assert!(gap(&world) < 2e-3 && meet, "{speed} {hz}: {before} {}", gap(&world));
+            }
+            assert!(crashed || !meet || before > 1e-3, "{speed} {hz}: not seen at {before}");
+            seen |= crashed;
+            let momentum = world.drones[0].motion.linvel + world.drones[1].motion.linvel;
+            assert!(momentum.length() < 1e-5, "{speed} {hz}: {momentum:?}");
+        }
+        assert!(seen);
+        let after = world.drones[0].motion.linvel.x;
+        assert!(after < 0.2 * speed as f32, "{speed} {hz}: goes on with {after}");
+    }
+}
+
+#[test]
+fn a_drone_that_falls_crashes_on_the_ground_and_stays_there() {
+    let mut drones = episode(&task(2), &[[0.0, 0.0, 0.3], [1.0, 0.0, 1.5]], &[[0.0, 0.0, -1.9], [0.0; 3]]);
+    let mut down = [1; 6];
+    down[2] = 2;
+    let mut seen = step(&mut drones, &down);
+    let mut commands = 1;
+    while crash(&drones, 0).is_none() {
+        assert!(seen.positions[2] > 0.0125 && commands < 20);
+        seen = step(&mut drones, &down);
+        commands += 1;
+    }
+    assert_eq!(crash(&drones, 0), Some(Crash::Ground));
+    assert!(seen.rewards[0] < -9.0 && seen.extras[5] == 1.0, "{seen:?}");
+    assert_eq!((seen.extras[0], seen.extras[1], seen.extras[2]), (0.0, 0.0, 0.0));
+    for _ in 0..60 {
+        seen = step(&mut drones, &down);
+        assert_eq!(seen.rewards[0], 0.0);
+        assert!(seen.positions[2] > 0.005, "{seen:?}");
+    }
+    assert!(drones.episodes[0].world.drones[0].fixed, "{:?}", drones.episodes[0].world.drones[0]);
+    assert!((seen.positions[2] - 0.0125).abs() < 2e-3 && seen.velocities[2] == 0.0, "{seen:?}");
+    assert_eq!(crash(&drones, 1), None);
+    let score = drones.scores()[0];
+    assert_eq!(score.collision_rate, 0.5);
+}
+
+#[test]
+fn a_crashed_drone_is_still_in_the_way() {
+    // The first one lies on the ground; the second one flies down onto it.
+    let mut drones = episode(&task(2), &[[0.0, 0.0, 0.1], [0.02, 0.0, 1.0]], &[[0.0, 0.0, -1.9], [0.0; 3]]);
+    for _ in 0..40 {
+        step(&mut drones, &[1, 1, 2, 1, 1, 1]);
+    }
+    assert_eq!((crash(&drones, 0), crash(&drones, 1)), (Some(Crash::Ground), None));
+    assert!(drones.episodes[0].world.drones[0].fixed);
+    for _ in 0..60 {
+        step(&mut drones, &[1, 1, 1, 1, 1, 2]);
+    }
+    assert_eq!(crash(&drones, 1), Some(Crash::Contact));
+}
+
+#[test]
+fn a_tilt_beyond_the_horizon_is_a_crash_in_its_step() {
+    let laws = Laws::new(Craft::CF2X, Effects::default(), Downwash::Off, 1.0 / 120.0);
+    let (sin, cos) = (libm::sin(0.75), libm::cos(0.75));
+    let start = State { attitude: [sin, 0.0, 0.0, cos], spin: [2.0, 0.0, 0.0], ..state([0.0, 0.0, 5.0], [0.0; 3]) };
+    let mut world = World::new(vec![Drone::at(&start)]);
+    let mut steps = 0;
+    while world.drones[0].crash.is_none() {
+        assert!(linalg::Mat3::of(world.drones[0].state().attitude).0[2][2] >= 0.0 && steps < 20);
+        world.step(&laws, &[[9440.3; 4]]);
+        world.judge();
+        steps += 1;
+    }
+    assert_eq!(world.drones[0].crash, Some(Crash::Tilt));
+    // From 1.5 rad at 2 rad/s: the horizon is 0.0708 rad away, 4.2 steps.
+    assert_eq!(steps, 5);
+}
+
+#[test]
+fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
+    let positions = [[0.0, 0.0, 1.5], [0.5, 0.0, 1.7], [0.0, 0.6, 1.3]];
+    let mut drones = episode(&task(3), &positions, &[[0.0; 3]; 3]);
+    step(&mut drones, &[1; 9]);
+    let before = drones.episodes[0].world.drones[0].motion.pose;
+    drones.episodes[0].spoil(0);
+    for _ in 0..30 {
+        let seen = step(&mut drones, &[1; 9]);
+        assert!(seen.finite(), "{seen:?}");
+        assert_eq!(drones.episodes[0].world.drones[0].motion.pose, before);
+    }
+    assert_eq!(crash(&drones, 0), Some(Crash::NotFinite));
+    assert_eq!((crash(&drones, 1), crash(&drones, 2)), (None, None));
+    assert!(drones.scores()[0].reward.is_finite());
+}
+
+#[test]
+fn the_reward_is_the_documented_sum() {
+    let mut task = task(2);
+    task.drones.downwash = Downwash::Off;
+    let positions = [[0.0, 0.0, 1.5], [0.3, 0.0, 1.5]];
+    let landmarks = [0.0, 0.1, 1.5, 2.0, 0.0, 1.5];
+    let mut drones = Drones::from_state(&task, positions.as_flattened(), &[0.0; 6], &landmarks).unwrap();
+    drones.set_goals(&[0, 1]).unwrap();
+    let (mut before, mut sum) = ([0.1, 1.7], 0.0);
+    for _ in 0..5 {
+        let seen = step(&mut drones, &[1, 1, 1, 0, 1, 1]);
+        let place = |i: usize| -> [f64; 3] { std::array::from_fn(|d| f64::from(seen.positions[3 * i + d])) };
+        let distance = |a: [f64; 3], b: [f64; 3]| linalg::norm(linalg::sub(a, b));
+        let closeness = (1.0 - distance(place(0), place(1)) / 0.4).max(0.0);
+        for (i, bonus) in [(0, 0.1), (1, 0.0)] {
+            let goal: [f64; 3] = std::array::from_fn(|d| f64::from(landmarks[3 * i + d]));
+            let now = distance(place(i), goal);
+            let expected = 2.0 * (before[i] - now) + bonus - closeness;
+            assert!((f64::from(seen.rewards[i]) - expected).abs() < 1e-6, "{i}: {seen:?} {expected}");
+            (before[i], sum) = (now, sum + expected);
+        }
+    }
+    let score = drones.scores()[0];
+    assert!((f64::from(score.reward) - sum / 10.0).abs() < 1e-6);
+    assert_eq!((score.success, score.matched_success, score.spawn_success), (0.5, 0.5, 0.5));
+    assert_eq!((score.arrival_step, score.collision_rate), (121, 0.0));
+}
+
+#[test]
+fn two_landmarks_beside_one_drone_match_once() {
+    let landmarks = [0.0, 0.1, 1.5, 0.0, -0.1, 1.5];
+    let drones = Drones::from_state(&task(2), &[0.0, 0.0, 1.5, 2.0, 0.0, 1.5], &[0.0; 6], &landmarks).unwrap();
+    let score = drones.scores()[0];
+    assert_eq!((score.success, score.matched_success, score.spawn_success), (1.0, 0.5, 1.0));
+}
+
+#[test]
+fn mistakes_are_named() {
+    let task = task(2);
+    let text = |result: Result<(), EnvError>| result.unwrap_err().to_string();
+    let mut drones = Drones::new(&task, std::iter::once(stream(1))).unwrap();
+    assert!(text(drones.step(&[1; 6], &mut [0.0; 2])).contains("set_goals"));
+    assert!(text(drones.set_goals(&[0, 2])).contains("goals[1]: 2"));
+    assert!(text(drones.set_goals(&[0])).contains("goals: 1 entries"));
+    drones.set_goals(&[0, 1]).unwrap();
+    assert!(text(drones.step(&[1, 1, 1, 1, 3, 1], &mut [0.0; 2])).contains("actions[4]: 3"));
+    assert!(text(drones.step(&[1; 5], &mut [0.0; 2])).contains("actions: 5"));
+    assert!(text(drones.step(&[1; 6], &mut [0.0; 3])).contains("rewards: 3"));
+    assert!(text(drones.write_extras(&mut [0.0; 11])).contains("extras"));
+    assert_eq!(drones.steps(), 0);
+    let refused =
+        |positions: &[f32]| Drones::from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
+    assert!(refused(&[0.0; 5]).contains("positions"));
+    assert!(refused(&[0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0]).contains("positions[2]"));
+    for (hz, word) in [(100, "multiple"), (90, "chatters"), (30, "chatters"), (1950, "1920")] {
+        let mut task = task.clone();
+        task.drones.physics_hz = hz;
+        let error = Drones::new(&task, std::iter::once(stream(1))).err().unwrap().to_string();
+        assert!(error.contains("task.drones.physics_hz") && error.contains(word), "{error}");
+    }
+    let mut crowded = task.clone();
+    crowded.drones.spacing = 2.5;
+    assert!(Drones::new(&crowded, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.side"));
+    let spread = TaskConfig::simple_spread(2, Spawn::Uniform);
+    assert!(Drones::new(&spread, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.name"));
+}
+
+#[test]
+fn every_physics_rate_that_validates_flies() {
+    for hz in [120, 150, 240, 480] {
+        let mut task = task(1);
+        task.drones.physics_hz = hz;
+        assert_eq!(scripted(&task, 20), (1.0, 0.0), "{hz}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn starts_keep_their_distance_and_stay_in_the_box(n in 1..9usize, k in 0..1000u32) {
+        let task = task(n);
+        let drones = Drones::new(&task, std::iter::once(stream(k))).unwrap();
+        let mut positions = vec![0.0; 3 * n];
+        drones.write_positions(&mut positions).unwrap();
+        for points in [&positions[..], drones.landmarks()] {
+            let points: Vec<[f32; 3]> = points.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+            prop_assert!(apart(&points, 0.3 - 1e-5));
+            prop_assert!(points.iter().all(|p| p[0].abs() <= 1.5 && p[1].abs() <= 1.5 && p[2] == 1.5));
+        }
+    }
+
+    #[test]
+    fn an_episode_does_not_see_its_neighbours(k in 0..1000u32, actions in random_actions(6)) {
+        let task = task(2);
+        let mut together = Drones::new(&task, (k..k + 3).map(stream)).unwrap();
+        together.set_goals(&[0, 1, 1, 0, 0, 0]).unwrap();
+        let mut alone: Vec<_> = (k..k + 3).map(|k| Drones::new(&task, std::iter::once(stream(k))).unwrap()).collect();
+        for (drones, goals) in alone.iter_mut().zip([[0, 1], [1, 0], [0, 0]]) {
+            drones.set_goals(&goals).unwrap();
+        }
+        for actions in &actions {
+            let all = step(&mut together, actions);
+            for (b, drones) in alone.iter_mut().enumerate() {
+                let own = step(drones, &actions[6 * b..6 * (b + 1)]);
+                prop_assert_eq!(&all.positions[6 * b..6 * (b + 1)], &own.positions[..]);
+                prop_assert_eq!(&all.extras[12 * b..12 * (b + 1)], &own.extras[..]);
+                prop_assert_eq!(&all.rewards[2 * b..2 * (b + 1)], &own.rewards[..]);
+            }
+        }
+        for (b, drones) in alone.iter().enumerate() {
+            prop_assert_eq!(together.scores()[b], drones.scores()[0]);
+        }
+    }
+
+    #[test]
+    fn names_of_drones_do_not_matter_in_flight(shift in 1..4usize, actions in random_actions(4)) {
+        let task = task(4);
+        let positions = [[-1.0, 0.0, 1.5], [0.0, 0.1, 1.9], [0.2, 0.9, 1.6], [0.9, -0.9, 1.2]];
+        let turn = |i: usize| (i + shift) % 4;
+        let turned: Vec<[f32; 3]> = (0..4).map(|i| positions[turn(i)]).collect();
+        let (mut a, mut b) = (episode(&task, &positions, &[[0.0; 3]; 4]), episode(&task, &turned, &[[0.0; 3]; 4]));
+        for actions in actions.iter().take(8) {
+            let permuted: Vec<u8> = (0..4).flat_map(|i| actions[3 * turn(i)..3 * turn(i) + 3].to_vec()).collect();
+            let (a, b) = (step(&mut a, actions), step(&mut b, &permuted));
+            for i in 0..4 {
+                prop_assert_eq!(&b.positions[3 * i..3 * i + 3], &a.positions[3 * turn(i)..3 * turn(i) + 3]);
+                prop_assert_eq!(&b.extras[6 * i..6 * i + 6], &a.extras[6 * turn(i)..6 * turn(i) + 6]);
+            }
+        }
+    }
+
+    #[test]
+    fn a_mirrored_episode_is_the_mirror_image(actions in random_actions(2)) {
+        let task = task(2);
+        let mirror = |p: [f32; 3]| [p[0], -p[1], p[2]];
+        let positions = [[-0.4, 0.2, 1.5], [0.3, 0.5, 1.7]];
+        let (mut a, mut b) =
+            (episode(&task, &positions, &[[0.0; 3]; 2]), episode(&task, &positions.map(mirror), &[[0.0; 3]; 2]));
+        for actions in actions.iter().take(12) {
+            let mut mirrored = actions.clone();
+            for y in mirrored.iter_mut().skip(1).step_by(3) {
+                *y = 2 - *y;
+            }
+            let (a, b) = (step(&mut a, actions), step(&mut b, &mirrored));
+            for (a, b) in a.positions.chunks_exact(3).zip(b.positions.chunks_exact(3)) {
+                for d in 0..3 {
+                    let expected = if d == 1 { -a[d] } else { a[d] };
+                    prop_assert!((b[d] - expected).abs() < 2e-5, "{a:?} {b:?}");
+                }
+            }
+        }
+    }
+}
