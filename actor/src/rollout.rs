@@ -5,12 +5,13 @@ use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::rng::{Key, Purpose, Stream, sequence};
-use magex_core::trajectory::{EvalOutcome, Recording, Shape, ShardResult, Trajectory};
-use magex_env::scripted::scripted_actions;
-use magex_env::{EnvError, Spread};
+use magex_core::task::{ActionCode, Group, Stage};
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
+use magex_env::scripted::scripted;
+use magex_env::{Env, EnvError, View, new_env};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{self, Input, Network};
-use magex_nets::features::{FeatureSpec, Features, JointStates};
+use magex_nets::features::{FeatureSpec, Features, JointStates, Symmetry};
 use magex_nets::ops::GraphNoise;
 use magex_nets::params::{ParamError, Params, Source, from_safetensors};
 use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
@@ -96,69 +97,43 @@ impl Roller {
         assign: impl FnOnce(&GoalRequest) -> Result<GoalReply, E>,
     ) -> Result<ShardResult, RolloutError<E>> {
         let (task, seed) = (&self.config.task, self.config.run.seed);
-        let (b, n, d) = (shard.episodes as usize, task.agents, task.dims());
-        let steps = task.horizon as usize;
+        let keep = shard.kind == ShardKind::Train;
+        let shape = task.shape(shard.episodes as usize);
+        let (b, n, steps) = (shape.episodes, shape.agents, shape.steps);
         let keys: Vec<_> = (0..shard.episodes).map(|e| episode_keys(seed, shard, e)).collect();
 
         // Reset, then goals, then the first observation: an agent never sees a goal of another episode.
-        let mut worlds = Spread::new(task, keys.iter().map(|k| k.spawn.stream()))?;
-        let landmarks = worlds.landmarks().to_vec();
-        let request = GoalRequest {
-            shard: *shard,
-            seed,
-            scheduler: SchedulerKind::Learned,
-            agent_count: n,
-            goal_count: n,
-            dims: d,
-            agents: worlds.positions(),
-            goals: landmarks.clone(),
-        };
+        let mut worlds = new_env(task, keys.iter().map(|k| k.spawn.stream()), keep)?;
+        let mut state = JointState::new(&shape, worlds.landmarks());
+        state.read(worlds.as_ref())?;
+        let request = state.goal_request(&shape, task.stages(), shard, seed);
         let reply = assign(&request).map_err(RolloutError::Goals)?;
-        worlds.set_goals(&reply.goals)?;
+        state.goals = chain(&shape, &reply.goals);
+        worlds.set_goals(&state.goals)?;
 
-        let shape = Shape {
-            steps,
-            episodes: b,
-            agents: n,
-            bodies: n,
-            landmarks: n,
-            dims: d,
-            targets: 1,
-            heads: self.heads.count(),
-        };
-        let state = b * n * d;
-        let keep = shard.kind == ShardKind::Train;
         let mut out = columns(&shape, shard, keep);
-        let mut recording = Vec::new();
-        let (mut positions, mut velocities) = (vec![0.0; state], vec![0.0; state]);
+        let mut recording = (Vec::new(), Vec::new());
         let mut actions = vec![0u8; b * n * shape.heads];
         let (mut log_probs, mut rewards) = (vec![0.0; b * n], vec![0.0; b * n]);
-        let targets = target_positions(&landmarks, &reply.goals, n, d);
         let mut policy = Policy::new(self, shard, b, &keys.iter().map(|k| k.graph).collect::<Vec<_>>());
         let mut streams: Vec<Stream> = keys.iter().map(|k| k.action.stream()).collect();
         for step in 0..=steps {
-            worlds.write_positions(&mut positions)?;
-            worlds.write_velocities(&mut velocities)?;
+            state.read(worlds.as_ref())?;
             if keep {
-                out.positions.extend_from_slice(&positions);
-                out.velocities.extend_from_slice(&velocities);
+                out.positions.extend_from_slice(&state.positions);
+                out.velocities.extend_from_slice(&state.velocities);
+                out.extras.extend_from_slice(&state.extras);
             } else if shard.record {
-                recording.extend_from_slice(&positions[..n * d]);
+                recording.0.extend_from_slice(&state.positions[..shape.bodies * shape.dims]);
+                recording.1.extend_from_slice(&state.extras[..n * shape.extras]);
             }
             if step == steps {
                 break;
             }
+            let mut symmetries: Vec<Symmetry> = Vec::new();
             match &self.driver {
                 Driver::Policy(network) => {
-                    let states = JointStates {
-                        agents: n,
-                        dims: d,
-                        targets_per_agent: 1,
-                        positions: &positions,
-                        velocities: &velocities,
-                        targets: &targets,
-                    };
-                    let features = self.spec.compute(&states);
+                    let features = self.spec.compute(&state.joint_states());
                     let logits = policy.logits(network.as_ref(), &features, step).map_err(ParamError::from)?;
                     if let Some(place) = logits.iter().position(|x| !x.is_finite()) {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
@@ -172,37 +147,162 @@ impl Roller {
                             &mut actions[row * shape.heads..(row + 1) * shape.heads],
                         );
                     }
+                    symmetries = features.symmetries;
                 }
-                Driver::Scripted => {
-                    scripted_actions(&positions, &velocities, &landmarks, &reply.goals, n, &mut actions)?;
-                }
+                Driver::Scripted => scripted(task, &state.view(), &mut actions)?,
             }
-            worlds.step(&actions, &mut rewards)?;
             if keep {
                 out.actions.extend_from_slice(&actions);
+            }
+            // The policy chose in each agent's own frame.
+            to_world(task.action_code(), shape.heads, &symmetries, &mut actions);
+            worlds.step(&actions, &mut rewards)?;
+            if keep {
                 out.log_probs.extend_from_slice(&log_probs);
                 out.rewards.extend_from_slice(&rewards);
             }
         }
-        let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
-        let metrics = worlds.metrics(&ratios)?;
+        let metrics = metrics(worlds.as_ref(), &reply, shape.targets);
         if !keep {
             let recording = shard.record.then(|| Recording {
                 shape: Shape { episodes: 1, ..shape },
-                positions: recording,
-                landmarks: landmarks[..n * d].to_vec(),
-                goals: reply.goals[..n].to_vec(),
+                positions: recording.0,
+                extras: recording.1,
+                landmarks: state.landmarks[..shape.landmarks * shape.dims].to_vec(),
+                goals: state.goals[..n * shape.targets].to_vec(),
             });
             return Ok(ShardResult::Eval(EvalOutcome { shard: *shard, metrics, recording }));
         }
-        out.landmarks = landmarks;
-        out.goals = reply.goals;
+        out.landmarks = state.landmarks;
+        out.goals = state.goals;
         out.goal_log_probs = reply.log_probs;
         out.costs = reply.costs;
         out.exact_costs = reply.exact_costs;
         out.metrics = metrics;
         Ok(ShardResult::Train(out))
     }
+}
+
+/// What the agents of B episodes see of them.
+struct JointState {
+    positions: Vec<f32>,
+    velocities: Vec<f32>,
+    extras: Vec<f32>,
+    landmarks: Vec<f32>,
+    goals: Vec<u32>,
+}
+
+impl JointState {
+    fn new(shape: &Shape, landmarks: &[f32]) -> Self {
+        let state = shape.episodes * shape.bodies * shape.dims;
+        Self {
+            positions: vec![0.0; state],
+            velocities: vec![0.0; state],
+            extras: vec![0.0; shape.episodes * shape.agents * shape.extras],
+            landmarks: landmarks.to_vec(),
+            goals: Vec::new(),
+        }
+    }
+
+    fn read(&mut self, worlds: &dyn Env) -> Result<(), EnvError> {
+        worlds.write_positions(&mut self.positions)?;
+        worlds.write_velocities(&mut self.velocities)?;
+        worlds.write_extras(&mut self.extras)
+    }
+
+    fn joint_states(&self) -> JointStates<'_> {
+        JointStates {
+            positions: &self.positions,
+            velocities: &self.velocities,
+            extras: &self.extras,
+            landmarks: &self.landmarks,
+            goals: &self.goals,
+        }
+    }
+
+    fn view(&self) -> View<'_> {
+        View {
+            positions: &self.positions,
+            velocities: &self.velocities,
+            extras: &self.extras,
+            landmarks: &self.landmarks,
+            goals: &self.goals,
+        }
+    }
+
+    /// The assignment problems of all episodes as they start.
+    fn goal_request(&self, shape: &Shape, stages: &[Stage], shard: &Shard, seed: u64) -> GoalRequest {
+        let group = |group: Group, episode: usize| {
+            let (points, per_episode, first) = match group {
+                Group::Agents => (&self.positions, shape.bodies, 0),
+                Group::Balls => (&self.positions, shape.bodies, shape.agents),
+                Group::Landmarks => (&self.landmarks, shape.landmarks, 0),
+            };
+            let from = (episode * per_episode + first) * shape.dims;
+            &points[from..from + shape.agents * shape.dims]
+        };
+        let (mut agents, mut goals) = (Vec::new(), Vec::new());
+        for episode in 0..shape.episodes {
+            for stage in stages {
+                agents.extend_from_slice(group(stage.from, episode));
+                goals.extend_from_slice(group(stage.to, episode));
+            }
+        }
+        GoalRequest {
+            shard: *shard,
+            seed,
+            scheduler: SchedulerKind::Learned,
+            stages: stages.len(),
+            agent_count: shape.agents,
+            goal_count: shape.agents,
+            dims: shape.dims,
+            agents,
+            goals,
+        }
+    }
+}
+
+/// [B, K, N] assignments, stage by stage, to the [B, N, K] goals that each agent finds by following them.
+fn chain(shape: &Shape, assigned: &[u32]) -> Vec<u32> {
+    let (n, k) = (shape.agents, shape.targets);
+    let mut goals = Vec::with_capacity(assigned.len());
+    for episode in assigned.chunks_exact(n * k) {
+        for agent in 0..n {
+            let mut at = agent;
+            for stage in episode.chunks_exact(n) {
+                // Out of range cannot be: the reply was checked. If it were, the environment would refuse it.
+                let next = stage.get(at).copied().unwrap_or(u32::MAX);
+                goals.push(next);
+                at = next as usize;
+            }
+        }
+    }
+    goals
+}
+
+/// Turns the policy's actions, in place, to the axes of the world; without frames they are along them already.
+fn to_world(code: ActionCode, heads: usize, symmetries: &[Symmetry], actions: &mut [u8]) {
+    for (symmetry, action) in symmetries.iter().zip(actions.chunks_exact_mut(heads)) {
+        symmetry.act(code, action);
+    }
+}
+
+/// What the episodes scored, and what the commander cost them.
+fn metrics(worlds: &dyn Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
+    let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
+    let episodes = worlds.scores().into_iter().zip(ratios.chunks_exact(stages.max(1)));
+    let metrics = episodes.map(|(score, ratios)| EpisodeMetrics {
+        success: score.success,
+        matched_success: score.matched_success,
+        spawn_success: score.spawn_success,
+        arrival_step: score.arrival_step,
+        collisions_per_agent_step: score.collisions_per_agent_step,
+        collision_rate: score.collision_rate,
+        reward: score.reward,
+        cost_ratio: ratios.first().copied().unwrap_or(1.0),
+        second_cost_ratio: ratios.get(1).copied(),
+    });
+    metrics.collect()
 }
 
 /// A trajectory to be filled, with room for its columns if they are kept.
@@ -215,6 +315,7 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         shape: *shape,
         positions: Vec::with_capacity(state),
         velocities: Vec::with_capacity(state),
+        extras: Vec::with_capacity(room((shape.steps + 1) * shape.episodes * shape.agents * shape.extras)),
         landmarks: Vec::new(),
         goals: Vec::new(),
         actions: Vec::with_capacity(rows * shape.heads),
@@ -270,14 +371,4 @@ impl Policy {
 fn heads(config: &RunConfig) -> Result<ActionHeads, ParamError> {
     ActionHeads::new(config.task.action_heads())
         .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))
-}
-
-/// [B, N, D] position of every agent's goal.
-fn target_positions(landmarks: &[f32], goals: &[u32], n: usize, d: usize) -> Vec<f32> {
-    let mut out = Vec::with_capacity(goals.len() * d);
-    for (row, &goal) in goals.iter().enumerate() {
-        let at = (row / n * n + goal as usize) * d;
-        out.extend_from_slice(&landmarks[at..at + d]);
-    }
-    out
 }

@@ -29,14 +29,14 @@ fn answer(
     solver: &mut Solver,
     costs: &[f64],
     (rows, cols): (usize, usize),
-    stream: impl FnOnce() -> Stream,
+    stream: &mut Stream,
 ) -> Result<Answer, AssignError> {
     let exact = solver.solve(costs, rows, cols)?;
     let exact_cost = exact.cost;
     let goals = match kind {
         SchedulerKind::Exact | SchedulerKind::Learned => exact.col_of_row,
         SchedulerKind::Greedy => greedy(costs, rows, cols)?.col_of_row,
-        SchedulerKind::Random => random(rows, cols, &mut stream())?,
+        SchedulerKind::Random => random(rows, cols, stream)?,
     };
     let cost = cost_of(costs, cols, &goals);
     Ok(Answer { goals, cost, exact_cost })
@@ -44,20 +44,23 @@ fn answer(
 
 /// Goals for the episodes of a shard.
 pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignError> {
-    let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
+    let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     if g < n {
         return Err(AssignError::invalid("goals", format!("{g} goals are not enough for {n} agents")));
     }
-    if n == 0 || d == 0 {
-        return Err(AssignError::invalid("agents", format!("{n} agents in {d} dimensions make no team")));
+    if n == 0 || d == 0 || k == 0 {
+        return Err(AssignError::invalid("agents", format!("{k} stages of {n} agents in {d} dimensions make no team")));
     }
     let mut solver = Solver::default();
     let mut reply = GoalReply { goals: Vec::new(), log_probs: Vec::new(), costs: Vec::new(), exact_costs: Vec::new() };
-    let episodes = request.agents.chunks_exact(n * d).zip(request.goals.chunks_exact(g * d));
-    for (b, (agents, goals)) in episodes.enumerate() {
-        let stream = || episode_keys(request.seed, &request.shard, b as u32).commander.stream();
+    let teams = request.agents.chunks_exact(n * d).zip(request.goals.chunks_exact(g * d));
+    let mut stream = episode_keys(request.seed, &request.shard, 0).commander.stream();
+    for (index, (agents, goals)) in teams.enumerate() {
+        if index % k == 0 {
+            stream = episode_keys(request.seed, &request.shard, (index / k) as u32).commander.stream();
+        }
         let costs = distances(agents, goals, d)?;
-        let answer = answer(request.scheduler, &mut solver, &costs, (n, g), stream)?;
+        let answer = answer(request.scheduler, &mut solver, &costs, (n, g), &mut stream)?;
         reply.goals.extend(answer.goals);
         reply.log_probs.push(0.0);
         reply.costs.push(answer.cost as f32);
@@ -69,9 +72,9 @@ pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignErr
 /// Goals for one team.
 pub(crate) fn assign_team(kind: SchedulerKind, request: &TeamRequest) -> Result<TeamReply, AssignError> {
     let costs = distances(&request.agents, &request.goals, request.dims)?;
-    let stream = || Key::new(request.seed, Purpose::Request, &[]).stream();
+    let mut stream = Key::new(request.seed, Purpose::Request, &[]).stream();
     let shape = (request.agent_count, request.goal_count);
-    let answer = answer(kind, &mut Solver::default(), &costs, shape, stream)?;
+    let answer = answer(kind, &mut Solver::default(), &costs, shape, &mut stream)?;
     let goals = answer.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
     Ok(TeamReply { goals, probabilities: None })
 }

@@ -1,39 +1,50 @@
 //! Answers for the teams of one shard: a pure function of the request and the weights.
 
 use magex_assign::exact_points;
-use magex_core::keys::episode_keys;
+use magex_assign::random::random;
+use magex_core::keys::{episode_keys, random_goals};
 use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::goals::{GoalReply, GoalRequest};
 
-/// Assigns the goals of every episode of a shard. What is random is keyed by (seed, shard, episode).
-pub fn answer(commander: &Commander, request: &GoalRequest) -> Result<GoalReply, CommanderError> {
-    let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
+/// Assigns the goals of every stage of every episode of a shard. What is random is keyed by (seed, shard, episode).
+/// `random_share` of the training episodes get a random matching, whatever the scheduler.
+pub fn answer(commander: &Commander, random_share: f32, request: &GoalRequest) -> Result<GoalReply, CommanderError> {
+    let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     let b = request.shard.episodes as usize;
-    if n == 0 || d == 0 || request.agents.len() != b * n * d || request.goals.len() != b * g * d {
+    if n == 0 || d == 0 || request.agents.len() != b * k * n * d || request.goals.len() != b * k * g * d {
         return Err(CommanderError::Instance(format!(
-            "agents, goals: {} and {} numbers do not make {b} teams of {n} agents and {g} goals in {d} dimensions",
+            "agents, goals: {} and {} numbers do not make {b} times {k} teams of {n} agents and {g} goals in {d} dimensions",
             request.agents.len(),
             request.goals.len()
         )));
     }
     let mut reply = GoalReply {
-        goals: Vec::with_capacity(b * n),
-        log_probs: Vec::with_capacity(b),
-        costs: Vec::with_capacity(b),
-        exact_costs: Vec::with_capacity(b),
+        goals: Vec::with_capacity(b * k * n),
+        log_probs: Vec::with_capacity(b * k),
+        costs: Vec::with_capacity(b * k),
+        exact_costs: Vec::with_capacity(b * k),
     };
     for e in 0..b {
-        let team = Team {
-            agents: &request.agents[e * n * d..(e + 1) * n * d],
-            goals: &request.goals[e * g * d..(e + 1) * g * d],
-            dims: d,
-        };
         let mut stream = episode_keys(request.seed, &request.shard, e as u32).commander.stream();
-        let decision = commander.assign(&team, request.shard.mode, &mut stream)?;
-        reply.costs.push(cost(&team, &decision.goals) as f32);
-        reply.exact_costs.push(exact_points(team.agents, team.goals, d)?.1 as f32);
-        reply.log_probs.push(decision.log_prob);
-        reply.goals.extend(decision.goals);
+        let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_share);
+        for stage in e * k..(e + 1) * k {
+            let team = Team {
+                agents: &request.agents[stage * n * d..(stage + 1) * n * d],
+                goals: &request.goals[stage * g * d..(stage + 1) * g * d],
+                dims: d,
+            };
+            let (goals, log_prob) = match &mut shuffled {
+                Some(stream) => (random(n, g, stream)?, 0.0),
+                None => {
+                    let decision = commander.assign(&team, request.shard.mode, &mut stream)?;
+                    (decision.goals, decision.log_prob)
+                }
+            };
+            reply.costs.push(cost(&team, &goals) as f32);
+            reply.exact_costs.push(exact_points(team.agents, team.goals, d)?.1 as f32);
+            reply.log_probs.push(log_prob);
+            reply.goals.extend(goals);
+        }
     }
     Ok(reply)
 }

@@ -214,9 +214,9 @@ impl CommanderService for CommanderApi {
         request: Request<v1::AssignBatchRequest>,
     ) -> Result<Response<v1::AssignBatchResponse>, Status> {
         let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(invalid)?;
-        let (episodes, agents, version) = (request.shard.episodes as usize, request.agent_count, request.shard.version);
-        let reply = self.batch_with(request, &key).await?;
-        Ok(Response::new(reply.to_message(episodes, agents, version)))
+        let version = request.shard.version;
+        let reply = self.batch_with(request.clone(), &key).await?;
+        Ok(Response::new(reply.to_message(&request, version)))
     }
 
     async fn get_model(&self, _: Request<v1::GetModelRequest>) -> Result<Response<v1::GetModelResponse>, Status> {

@@ -12,6 +12,8 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub struct TrainedScheduler {
     commander: Commander,
+    /// `commander.random_share` of the run.
+    random_share: f32,
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
@@ -23,12 +25,12 @@ pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn S
         None => Commander::load(&config.commander, config.task.agents, config.task.dims(), weights)
             .map_err(|error| failed(error.to_string()))?,
     };
-    Ok(Arc::new(TrainedScheduler { commander }))
+    Ok(Arc::new(TrainedScheduler { commander, random_share: config.commander.random_share }))
 }
 
 impl Scheduler for TrainedScheduler {
     fn assign_batch(&self, request: &GoalRequest) -> Result<GoalReply, AssignError> {
-        answer(&self.commander, request).map_err(|error| match error {
+        answer(&self.commander, self.random_share, request).map_err(|error| match error {
             CommanderError::Instance(problem) => AssignError::Invalid { field: "agents".to_owned(), problem },
             other => AssignError::Failed(other.to_string()),
         })

@@ -29,7 +29,17 @@ impl Batch {
         let episodes: Vec<(&Trajectory, usize)> =
             trajectories.iter().flat_map(|t| (0..t.shape.episodes).map(move |b| (t, b))).collect();
         let mut shape = trajectories.first().map_or(
-            Shape { steps: 0, episodes: 0, agents: 0, bodies: 0, landmarks: 0, dims: 0, targets: 0, heads: 0 },
+            Shape {
+                steps: 0,
+                episodes: 0,
+                agents: 0,
+                bodies: 0,
+                landmarks: 0,
+                dims: 0,
+                extras: 0,
+                targets: 0,
+                heads: 0,
+            },
             |t| t.shape,
         );
         shape.episodes = episodes.len();
@@ -91,26 +101,19 @@ impl Batch {
 /// Features of all T+1 states of one episode of a trajectory.
 fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
     let s = &t.shape;
-    let (n, d, k) = (s.agents, s.dims, s.targets);
-    let states = s.steps + 1;
-    let mut positions = Vec::with_capacity(states * n * d);
-    let mut velocities = Vec::with_capacity(states * n * d);
-    for step in 0..states {
-        let at = (step * s.episodes + b) * s.bodies * d;
-        positions.extend_from_slice(&t.positions[at..at + n * d]);
-        velocities.extend_from_slice(&t.velocities[at..at + n * d]);
-    }
-    let landmarks = &t.landmarks[b * s.landmarks * d..(b + 1) * s.landmarks * d];
-    let goals = &t.goals[b * n * k..(b + 1) * n * k];
-    let once: Vec<f32> =
-        goals.iter().flat_map(|&g| &landmarks[g as usize * d..(g as usize + 1) * d]).copied().collect();
-    let targets = once.repeat(states);
+    // The rows of one episode out of [T+1, B, width].
+    let episode = |data: &[f32], width: usize| -> Vec<f32> {
+        let rows = (0..=s.steps).flat_map(|step| {
+            let at = (step * s.episodes + b) * width;
+            &data[at..at + width]
+        });
+        rows.copied().collect()
+    };
     spec.compute(&JointStates {
-        agents: n,
-        dims: d,
-        targets_per_agent: k,
-        positions: &positions,
-        velocities: &velocities,
-        targets: &targets,
+        positions: &episode(&t.positions, s.bodies * s.dims),
+        velocities: &episode(&t.velocities, s.bodies * s.dims),
+        extras: &episode(&t.extras, s.agents * s.extras),
+        landmarks: &t.landmarks[b * s.landmarks * s.dims..(b + 1) * s.landmarks * s.dims],
+        goals: &t.goals[b * s.agents * s.targets..(b + 1) * s.agents * s.targets],
     })
 }

@@ -6,11 +6,8 @@ use crate::trainer::TrainError;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
-use magex_core::trajectory::{Shape, Trajectory};
+use magex_core::trajectory::Trajectory;
 use std::time::Instant;
-
-/// −log-probability of any of five actions under the uniform policy.
-const LN_5: f32 = 1.609_438;
 
 /// What a minibatch takes on one thread, medians in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
@@ -76,15 +73,17 @@ fn median(mut times: Vec<f64>) -> f64 {
 
 /// B episodes of agents anywhere on the map, doing anything.
 fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
-    let (t, b, n) = (config.task.horizon as usize, episodes, config.task.agents);
-    let shape = Shape { steps: t, episodes: b, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 };
+    let shape = config.task.shape(episodes);
+    let (t, b, n) = (shape.steps, episodes, shape.agents);
     let mut stream = Key::new(config.run.seed, Purpose::Bench, &[3]).stream();
     let half = f64::from(config.task.side / 2.0);
     let mut within =
         |limit: f64, count: usize| -> Vec<f32> { (0..count).map(|_| stream.range(-limit, limit) as f32).collect() };
-    let state = (t + 1) * b * n * 2;
+    let state = (t + 1) * b * shape.bodies * shape.dims;
     let (positions, velocities) = (within(half, state), within(1.0, state));
-    let (landmarks, rewards) = (within(half, b * n * 2), within(1.0, t * b * n));
+    let (landmarks, rewards) = (within(half, b * n * shape.dims), within(1.0, t * b * n));
+    let choices = config.task.action_heads();
+    let uniform: f64 = choices.iter().map(|&c| -(c as f64).ln()).sum();
     Trajectory {
         shard: Shard {
             kind: ShardKind::Train,
@@ -100,14 +99,17 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
         shape,
         positions,
         velocities,
+        extras: vec![0.0; (t + 1) * b * n * shape.extras],
         landmarks,
-        goals: (0..b * n).map(|i| (i % n) as u32).collect(),
-        actions: (0..t * b * n).map(|_| stream.below(5) as u8).collect(),
-        log_probs: vec![-LN_5; t * b * n],
+        goals: (0..b * n).flat_map(|i| std::iter::repeat_n((i % n) as u32, shape.targets)).collect(),
+        actions: (0..t * b * n)
+            .flat_map(|_| choices.iter().map(|&c| stream.below(c as u32) as u8).collect::<Vec<_>>())
+            .collect(),
+        log_probs: vec![uniform as f32; t * b * n],
         rewards,
-        goal_log_probs: vec![0.0; b],
-        costs: vec![1.0; b],
-        exact_costs: vec![1.0; b],
+        goal_log_probs: vec![0.0; b * shape.targets],
+        costs: vec![1.0; b * shape.targets],
+        exact_costs: vec![1.0; b * shape.targets],
         metrics: Vec::new(),
     }
 }

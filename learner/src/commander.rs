@@ -1,4 +1,4 @@
-//! PPO for the goal commander: one decision per episode, reward R_c = 1 − C_c / C_h (paper, eq. 4), known as soon as
+//! PPO for the goal commander: one decision per episode and stage, reward R_c = 1 − C_c / C_h (paper, eq. 4), known as soon as
 //! the decision is made.
 //!
 //! The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic is needed. The
@@ -7,7 +7,9 @@
 use crate::adam::Adam;
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::CommanderConfig;
+use magex_core::keys::random_goals;
 use magex_core::rng::{Key, Purpose};
+use magex_core::task::{Group, Stage, TaskConfig};
 use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
 use magex_nets::ops::Pick;
@@ -52,13 +54,14 @@ pub struct CommanderPpo {
     config: CommanderConfig,
     agents: usize,
     dims: usize,
+    stages: &'static [Stage],
     seed: u64,
 }
 
 impl CommanderPpo {
-    /// For teams of `agents` agents.
-    pub fn new(config: &CommanderConfig, agents: usize, dims: usize, seed: u64) -> Self {
-        Self { config: config.clone(), agents, dims, seed }
+    /// For the teams of a task.
+    pub fn new(config: &CommanderConfig, task: &TaskConfig, seed: u64) -> Self {
+        Self { config: config.clone(), agents: task.agents, dims: task.dims(), stages: task.stages(), seed }
     }
 
     /// Fresh network and optimiser.
@@ -83,28 +86,37 @@ impl CommanderPpo {
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error) = (0.0, 0.0f64);
         for t in trajectories {
-            let (n, d, g) = (t.shape.agents, t.shape.dims, t.shape.landmarks);
+            let stages = self.stages.len();
             for b in 0..t.shape.episodes {
-                let team = Team {
-                    agents: &t.positions[b * t.shape.bodies * d..][..n * d],
-                    goals: &t.landmarks[b * g * d..(b + 1) * g * d],
-                    dims: d,
-                };
-                let instance = commander.instance(&team)?;
-                let goals = &t.goals[b * n..(b + 1) * n];
-                let picks = instance
-                    .picks_of(goals)
-                    .ok_or_else(|| CommanderError::Instance(format!("the goals of episode {b} are not one-to-one")))?;
-                let greedy = greedy_cost(&commander, &instance, &team)?;
-                let exact = f64::from(t.exact_costs[b]).max(1e-9);
-                let advantage = (greedy - f64::from(t.costs[b])) / exact;
-                ratio_sum += greedy / exact;
-                let log_probs =
-                    commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
-                let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
-                error = error.max(f64::from((total - t.goal_log_probs[b]).abs()) / picks.len().max(1) as f64);
-                samples.push(Sample { instance, picks, advantage: advantage as f32 });
+                if random_goals(self.seed, &t.shard, b as u32, self.config.random_share).is_some() {
+                    // The scheduler had no say in this episode.
+                    continue;
+                }
+                for (k, stage) in self.stages.iter().enumerate() {
+                    let team = Team {
+                        agents: start_of(t, stage.from, b),
+                        goals: start_of(t, stage.to, b),
+                        dims: t.shape.dims,
+                    };
+                    let instance = commander.instance(&team)?;
+                    let picks = stage_goals(t, b, k).and_then(|goals| instance.picks_of(&goals)).ok_or_else(|| {
+                        CommanderError::Instance(format!("the goals of stage {k} of episode {b} are not one-to-one"))
+                    })?;
+                    let at = b * stages + k;
+                    let greedy = greedy_cost(&commander, &instance, &team)?;
+                    let exact = f64::from(t.exact_costs[at]).max(1e-9);
+                    let advantage = (greedy - f64::from(t.costs[at])) / exact;
+                    ratio_sum += greedy / exact;
+                    let log_probs =
+                        commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
+                    let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
+                    error = error.max(f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64);
+                    samples.push(Sample { instance, picks, advantage: advantage as f32 });
+                }
             }
+        }
+        if samples.is_empty() {
+            return Ok(CommanderStats::default());
         }
         let mut stats = self.improve(state, &samples, iteration, progress_rate)?;
         stats.greedy_cost_ratio = ratio_sum / samples.len().max(1) as f64;
@@ -190,6 +202,33 @@ impl CommanderPpo {
             })
             .collect()
     }
+}
+
+/// Where a group of bodies stands when an episode starts, [N, D].
+fn start_of(t: &Trajectory, group: Group, episode: usize) -> &[f32] {
+    let s = &t.shape;
+    let (points, per_episode, first) = match group {
+        Group::Agents => (&t.positions, s.bodies, 0),
+        Group::Balls => (&t.positions, s.bodies, s.agents),
+        Group::Landmarks => (&t.landmarks, s.landmarks, 0),
+    };
+    let from = (episode * per_episode + first) * s.dims;
+    &points[from..from + s.agents * s.dims]
+}
+
+/// The k-th stage's assignment of an episode, `[N]`, out of the agents' chains of goals; `None` if it is not one-to-one.
+fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Vec<u32>> {
+    let (n, stages) = (t.shape.agents, t.shape.targets);
+    let mut goals = vec![u32::MAX; n];
+    for (agent, chain) in t.goals[episode * n * stages..(episode + 1) * n * stages].chunks_exact(stages).enumerate() {
+        let from = if k == 0 { agent } else { chain[k - 1] as usize };
+        let slot = goals.get_mut(from)?;
+        if *slot != u32::MAX {
+            return None;
+        }
+        *slot = chain[k];
+    }
+    Some(goals)
 }
 
 /// C of the most likely decision.

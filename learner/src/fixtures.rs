@@ -23,14 +23,16 @@ pub(crate) fn train_shard(iteration: u32, index: u32, episodes: u32) -> Shard {
 }
 
 fn shape(task: &TaskConfig, episodes: usize) -> Shape {
-    let (n, steps) = (task.agents, task.horizon as usize);
-    Shape { steps, episodes, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 }
+    task.shape(episodes)
 }
 
 fn metrics(episodes: usize) -> Vec<EpisodeMetrics> {
     let one = EpisodeMetrics {
         success: 0.5,
         matched_success: 0.5,
+        spawn_success: 0.1,
+        collision_rate: 0.0,
+        second_cost_ratio: None,
         arrival_step: 2,
         collisions_per_agent_step: 0.1,
         reward: -0.2,
@@ -47,6 +49,7 @@ pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
         shape,
         positions: vec![0.5; (t + 1) * b * n * 2],
         velocities: vec![0.1; (t + 1) * b * n * 2],
+        extras: vec![],
         landmarks: vec![0.2; b * n * 2],
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
@@ -66,6 +69,7 @@ pub(crate) fn eval_outcome(task: &TaskConfig, mut shard: Shard, record: bool) ->
     let recording = record.then(|| Recording {
         shape,
         positions: vec![0.5; (shape.steps + 1) * n * 2],
+        extras: vec![],
         landmarks: vec![0.2; n * 2],
         goals: (0..n as u32).collect(),
     });

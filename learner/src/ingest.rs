@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard};
-use magex_core::task::{TaskConfig, TaskName};
+use magex_core::task::TaskConfig;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
 
@@ -21,18 +21,7 @@ impl Limits {
     /// The limits of a task whose shards have at most `max_episodes` episodes.
     pub fn for_task(task: &TaskConfig, max_episodes: usize) -> Self {
         let action_heads = task.action_heads();
-        let shape = match task.name {
-            TaskName::SimpleSpread => Shape {
-                steps: task.horizon as usize,
-                episodes: max_episodes,
-                agents: task.agents,
-                bodies: task.agents,
-                landmarks: task.agents,
-                dims: task.dims(),
-                targets: 1,
-                heads: action_heads.len(),
-            },
-        };
+        let shape = task.shape(max_episodes);
         Self { shape, action_heads, max_actors: 256 }
     }
 
@@ -41,9 +30,10 @@ impl Limits {
         let s = &self.shape;
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
-        let floats = 2 * state + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b;
+        let extras = (t + 1) * b * n * s.extras;
+        let floats = 2 * state + extras + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b * s.targets;
         let goals = b * n * s.targets;
-        4 * (floats + goals) + t * b * n * s.heads + 64 * b + 64 * 1024
+        4 * (floats + goals) + t * b * n * s.heads + 96 * b + 64 * 1024
     }
 }
 
@@ -88,18 +78,18 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
     check_metrics("trajectory.metrics", &trajectory.metrics)
 }
 
-/// Every agent has a landmark of its own.
+/// Every agent has goals of its own, in every stage.
 fn check_one_to_one(trajectory: &Trajectory) -> Result<(), ConvertError> {
     let shape = &trajectory.shape;
-    if shape.targets != 1 || shape.landmarks < shape.agents {
-        return Ok(());
-    }
-    for (episode, goals) in trajectory.goals.chunks(shape.agents.max(1)).enumerate() {
-        let mut taken = vec![false; shape.landmarks.max(shape.bodies)];
-        for (agent, &goal) in goals.iter().enumerate() {
-            if std::mem::replace(&mut taken[goal as usize], true) {
-                let problem = format!("goal {goal} is assigned twice");
-                return Err(ConvertError::new(format!("trajectory.goals[{episode}][{agent}]"), problem));
+    let (n, k) = (shape.agents.max(1), shape.targets.max(1));
+    for (episode, goals) in trajectory.goals.chunks(n * k).enumerate() {
+        let mut taken = vec![false; n * k];
+        for (place, &goal) in goals.iter().enumerate() {
+            let field = || format!("trajectory.goals[{episode}][{}][{}]", place / k, place % k);
+            match taken.get_mut(goal as usize * k + place % k) {
+                Some(taken) if !*taken => *taken = true,
+                Some(_) => return Err(ConvertError::new(field(), format!("goal {goal} is assigned twice"))),
+                None => return Err(ConvertError::new(field(), format!("{goal} is not below {n}"))),
             }
         }
     }
@@ -122,7 +112,9 @@ fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError
 
 fn check_recording(limits: &Limits, recording: &Recording) -> Result<(), ConvertError> {
     check_shape("eval.recording.shape", &recording.shape, limits, 1)?;
-    for (name, values) in [("positions", &recording.positions), ("landmarks", &recording.landmarks)] {
+    for (name, values) in
+        [("positions", &recording.positions), ("extras", &recording.extras), ("landmarks", &recording.landmarks)]
+    {
         if let Some(place) = values.iter().position(|value| !value.is_finite()) {
             let problem = format!("{} is not finite", values[place]);
             return Err(ConvertError::new(format!("eval.recording.{name}[{place}]"), problem));
@@ -151,6 +143,9 @@ fn check_metrics(field: &str, metrics: &[EpisodeMetrics]) -> Result<(), ConvertE
         let named = [
             ("success", m.success),
             ("matched_success", m.matched_success),
+            ("spawn_success", m.spawn_success),
+            ("collision_rate", m.collision_rate),
+            ("second_cost_ratio", m.second_cost_ratio.unwrap_or(0.0)),
             ("collisions_per_agent_step", m.collisions_per_agent_step),
             ("reward", m.reward),
             ("cost_ratio", m.cost_ratio),

@@ -29,8 +29,14 @@ pub struct EvalSummary {
     pub collisions_per_agent_step: f64,
     /// Mean reward per agent and step.
     pub reward: f64,
-    /// Mean C_c / C_h.
+    /// Mean C_c / C_h of agents to their first goals.
     pub cost_ratio: f64,
+    /// The same of the second stage, if the task has one.
+    pub second_cost_ratio: Option<f64>,
+    /// Mean share of landmarks that the spawn already covered.
+    pub spawn_success_rate: f64,
+    /// Mean share of agents that crashed.
+    pub collision_rate: f64,
 }
 
 /// Means in the order of the episodes; `None` if there are none.
@@ -50,6 +56,13 @@ pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> 
         collisions_per_agent_step: mean(|e| e.collisions_per_agent_step.into()),
         reward: mean(|e| e.reward.into()),
         cost_ratio: mean(|e| e.cost_ratio.into()),
+        second_cost_ratio: episodes
+            .iter()
+            .map(|e| e.second_cost_ratio.map(f64::from))
+            .sum::<Option<f64>>()
+            .map(|sum| sum / count as f64),
+        spawn_success_rate: mean(|e| e.spawn_success.into()),
+        collision_rate: mean(|e| e.collision_rate.into()),
     })
 }
 
@@ -87,11 +100,19 @@ pub struct IterationMetrics {
     /// Greedy evaluation: see [`EvalSummary`].
     pub collisions_per_agent_step: Option<f64>,
     /// Greedy evaluation: see [`EvalSummary`].
+    pub collision_rate: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub spawn_success_rate: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
     pub cost_ratio: Option<f64>,
+    /// Greedy evaluation: see [`EvalSummary`].
+    pub second_cost_ratio: Option<f64>,
     /// Training episodes (sampled actions).
     pub sampled_success_rate: Option<f64>,
     /// Training episodes.
     pub sampled_collisions_per_agent_step: Option<f64>,
+    /// Training episodes.
+    pub sampled_collision_rate: Option<f64>,
     /// Training episodes (sampled goals).
     pub sampled_cost_ratio: Option<f64>,
     /// Training episodes: mean reward per agent and step.
@@ -132,9 +153,13 @@ impl IterationMetrics {
             all_covered_rate: eval(|e| e.all_covered_rate),
             arrival_step: eval(|e| e.arrival_step),
             collisions_per_agent_step: eval(|e| e.collisions_per_agent_step),
+            collision_rate: eval(|e| e.collision_rate),
+            spawn_success_rate: eval(|e| e.spawn_success_rate),
             cost_ratio: eval(|e| e.cost_ratio),
+            second_cost_ratio: evaluation.as_ref().and_then(|e| e.second_cost_ratio),
             sampled_success_rate: train(|e| e.success_rate),
             sampled_collisions_per_agent_step: train(|e| e.collisions_per_agent_step),
+            sampled_collision_rate: train(|e| e.collision_rate),
             sampled_cost_ratio: train(|e| e.cost_ratio),
             reward: train(|e| e.reward),
             executor: updates.map(|u| u.0),
@@ -161,8 +186,14 @@ pub struct Summary {
     pub arrival_step: f64,
     /// Greedy.
     pub collisions_per_agent_step: f64,
+    /// Greedy: mean share of agents that crashed.
+    pub collision_rate: f64,
+    /// Greedy: mean share of landmarks that the spawn already covered.
+    pub spawn_success_rate: f64,
     /// Greedy: mean C_c / C_h.
     pub cost_ratio: f64,
+    /// Greedy: the same of the second stage, if the task has one.
+    pub second_cost_ratio: Option<f64>,
     /// Joint environment steps trained on.
     pub joint_env_steps: u64,
     /// Agent steps trained on.
@@ -177,6 +208,8 @@ pub struct Summary {
     pub target_reached: bool,
     /// SHA-256 of weights.safetensors.
     pub weights_sha256: String,
+    /// Task.
+    pub task: String,
     /// Architecture of the executor.
     pub executor: String,
     /// Goal scheduler.
@@ -204,7 +237,10 @@ impl Summary {
             all_covered_rate: greedy.all_covered_rate,
             arrival_step: greedy.arrival_step,
             collisions_per_agent_step: greedy.collisions_per_agent_step,
+            collision_rate: greedy.collision_rate,
+            spawn_success_rate: greedy.spawn_success_rate,
             cost_ratio: greedy.cost_ratio,
+            second_cost_ratio: greedy.second_cost_ratio,
             joint_env_steps: progress.joint_env_steps,
             agent_steps: progress.joint_env_steps * config.task.agents as u64,
             wall_s,
@@ -212,6 +248,7 @@ impl Summary {
             final_episodes: config.run.final_episodes,
             target_reached: progress.on_target >= 2,
             weights_sha256,
+            task: config.task.name.to_string(),
             executor: config.executor.kind.to_string(),
             scheduler: config.commander.kind.to_string(),
             agents: config.task.agents,

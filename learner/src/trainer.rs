@@ -111,7 +111,7 @@ impl Trainer {
 
     fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mappo = Mappo::new(config)?;
-        let commander = CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed);
+        let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
         let learned = Learned { executor: mappo.start()?, commander: commander.start()? };
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
         let pool = rayon::ThreadPoolBuilder::new()

@@ -111,6 +111,7 @@ impl From<&Shape> for v1::Shape {
             dims: shape.dims as u32,
             targets: shape.targets as u32,
             heads: shape.heads as u32,
+            extras: shape.extras as u32,
         }
     }
 }
@@ -126,6 +127,7 @@ impl From<&v1::Shape> for Shape {
             dims: shape.dims as usize,
             targets: shape.targets as usize,
             heads: shape.heads as usize,
+            extras: shape.extras as usize,
         }
     }
 }
@@ -139,6 +141,9 @@ impl From<&EpisodeMetrics> for v1::EpisodeMetrics {
             collisions_per_agent_step: metrics.collisions_per_agent_step,
             reward: metrics.reward,
             cost_ratio: metrics.cost_ratio,
+            second_cost_ratio: metrics.second_cost_ratio,
+            spawn_success: metrics.spawn_success,
+            collision_rate: metrics.collision_rate,
         }
     }
 }
@@ -152,6 +157,9 @@ impl From<&v1::EpisodeMetrics> for EpisodeMetrics {
             collisions_per_agent_step: metrics.collisions_per_agent_step,
             reward: metrics.reward,
             cost_ratio: metrics.cost_ratio,
+            second_cost_ratio: metrics.second_cost_ratio,
+            spawn_success: metrics.spawn_success,
+            collision_rate: metrics.collision_rate,
         }
     }
 }
@@ -165,14 +173,15 @@ impl From<&Trajectory> for v1::Trajectory {
             shape: Some(s.into()),
             positions: Some(arrays::from_f32(&state, &trajectory.positions)),
             velocities: Some(arrays::from_f32(&state, &trajectory.velocities)),
+            extras: Some(arrays::from_f32(&[t + 1, b, n, s.extras], &trajectory.extras)),
             landmarks: Some(arrays::from_f32(&[b, s.landmarks, s.dims], &trajectory.landmarks)),
             goals: Some(arrays::from_u32(&[b, n, s.targets], &trajectory.goals)),
             actions: Some(arrays::from_u8(&[t, b, n, s.heads], &trajectory.actions)),
             log_probs: Some(arrays::from_f32(&[t, b, n], &trajectory.log_probs)),
             rewards: Some(arrays::from_f32(&[t, b, n], &trajectory.rewards)),
-            goal_log_probs: Some(arrays::from_f32(&[b], &trajectory.goal_log_probs)),
-            costs: Some(arrays::from_f32(&[b], &trajectory.costs)),
-            exact_costs: Some(arrays::from_f32(&[b], &trajectory.exact_costs)),
+            goal_log_probs: Some(arrays::from_f32(&[b, s.targets], &trajectory.goal_log_probs)),
+            costs: Some(arrays::from_f32(&[b, s.targets], &trajectory.costs)),
+            exact_costs: Some(arrays::from_f32(&[b, s.targets], &trajectory.exact_costs)),
             metrics: trajectory.metrics.iter().map(Into::into).collect(),
         }
     }
@@ -188,14 +197,15 @@ fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, Conve
         shape,
         positions: arrays::to_f32("positions", message.positions, &state)?,
         velocities: arrays::to_f32("velocities", message.velocities, &state)?,
+        extras: arrays::to_f32("extras", message.extras, &[t + 1, b, n, s.extras])?,
         landmarks: arrays::to_f32("landmarks", message.landmarks, &[b, s.landmarks, s.dims])?,
         goals: arrays::to_u32("goals", message.goals, &[b, n, s.targets])?,
         actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.heads])?,
         log_probs: arrays::to_f32("log_probs", message.log_probs, &[t, b, n])?,
         rewards: arrays::to_f32("rewards", message.rewards, &[t, b, n])?,
-        goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b])?,
-        costs: arrays::to_f32("costs", message.costs, &[b])?,
-        exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b])?,
+        goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b, s.targets])?,
+        costs: arrays::to_f32("costs", message.costs, &[b, s.targets])?,
+        exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b, s.targets])?,
         metrics: message.metrics.iter().map(Into::into).collect(),
     })
 }
@@ -206,6 +216,7 @@ impl From<&Recording> for v1::Recording {
         Self {
             shape: Some(s.into()),
             positions: Some(arrays::from_f32(&[s.steps + 1, s.bodies, s.dims], &recording.positions)),
+            extras: Some(arrays::from_f32(&[s.steps + 1, s.agents, s.extras], &recording.extras)),
             landmarks: Some(arrays::from_f32(&[s.landmarks, s.dims], &recording.landmarks)),
             goals: Some(arrays::from_u32(&[s.agents, s.targets], &recording.goals)),
         }
@@ -220,6 +231,7 @@ impl TryFrom<v1::Recording> for Recording {
         Ok(Self {
             shape,
             positions: arrays::to_f32("positions", message.positions, &[s.steps + 1, s.bodies, s.dims])?,
+            extras: arrays::to_f32("extras", message.extras, &[s.steps + 1, s.agents, s.extras])?,
             landmarks: arrays::to_f32("landmarks", message.landmarks, &[s.landmarks, s.dims])?,
             goals: arrays::to_u32("goals", message.goals, &[s.agents, s.targets])?,
         })

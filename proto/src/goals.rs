@@ -73,28 +73,30 @@ pub struct GoalRequest {
     pub seed: u64,
     /// What hands out the goals.
     pub scheduler: SchedulerKind,
-    /// N: agents per episode.
+    /// K: assignment problems per episode, in order; see `TaskConfig::stages`.
+    pub stages: usize,
+    /// N: agents per problem.
     pub agent_count: usize,
-    /// G: goals per episode.
+    /// G: goals per problem.
     pub goal_count: usize,
     /// D: space dimensions.
     pub dims: usize,
-    /// `[B, N, D]` world units, with B = `shard.episodes`.
+    /// [B, K, N, D] world units, with B = `shard.episodes`.
     pub agents: Vec<f32>,
-    /// `[B, G, D]` world units.
+    /// [B, K, G, D] world units.
     pub goals: Vec<f32>,
 }
 
 /// The assignments of one shard.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GoalReply {
-    /// `[B, N]` the goal of each agent.
+    /// [B, K, N] the goal of each agent in each stage.
     pub goals: Vec<u32>,
-    /// `[B]` log-probability of each episode's assignment (0 unless learned).
+    /// [B, K] log-probability of each assignment (0 unless learned).
     pub log_probs: Vec<f32>,
-    /// `[B]` summed distance of each episode's assignment, world units.
+    /// [B, K] summed distance of each assignment, world units.
     pub costs: Vec<f32>,
-    /// `[B]` least summed distance possible, world units.
+    /// [B, K] least summed distance possible, world units.
     pub exact_costs: Vec<f32>,
 }
 
@@ -108,8 +110,8 @@ impl GoalRequest {
             seed: self.seed,
             shard: Some((&self.shard).into()),
             scheduler: v1::SchedulerKind::from(self.scheduler).into(),
-            agents: Some(arrays::from_f32(&[b, self.agent_count, self.dims], &self.agents)),
-            goals: Some(arrays::from_f32(&[b, self.goal_count, self.dims], &self.goals)),
+            agents: Some(arrays::from_f32(&[b, self.stages, self.agent_count, self.dims], &self.agents)),
+            goals: Some(arrays::from_f32(&[b, self.stages, self.goal_count, self.dims], &self.goals)),
         }
     }
 
@@ -117,46 +119,48 @@ impl GoalRequest {
     pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), ConvertError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
         let scheduler = message.scheduler().into();
-        let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 3)?;
-        let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 3)?;
-        let (b, dims) = (shard.episodes as usize, agent_shape[2]);
-        let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, agent_shape[1], dims])?)?;
-        let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, goal_shape[1], dims])?)?;
-        let (agent_count, goal_count) = (agent_shape[1], goal_shape[1]);
+        let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;
+        let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 4)?;
+        let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
+        let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
+        let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
+        let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
-        let request = Self { shard, seed: message.seed, scheduler, agent_count, goal_count, dims, agents, goals };
+        let request =
+            Self { shard, seed: message.seed, scheduler, stages, agent_count, goal_count, dims, agents, goals };
         Ok((request, WeightsKey { run_id: RunId(message.run_id), version, sha256: message.sha256 }))
     }
 }
 
 impl GoalReply {
-    /// The message of a reply for B episodes of N agents.
-    pub fn to_message(&self, episodes: usize, agents: usize, version: WeightsVersion) -> v1::AssignBatchResponse {
+    /// The message of a reply to a request.
+    pub fn to_message(&self, request: &GoalRequest, version: WeightsVersion) -> v1::AssignBatchResponse {
+        let problems = [request.shard.episodes as usize, request.stages];
         v1::AssignBatchResponse {
-            goals: Some(arrays::from_u32(&[episodes, agents], &self.goals)),
-            log_probs: Some(arrays::from_f32(&[episodes], &self.log_probs)),
-            costs: Some(arrays::from_f32(&[episodes], &self.costs)),
-            exact_costs: Some(arrays::from_f32(&[episodes], &self.exact_costs)),
+            goals: Some(arrays::from_u32(&[problems[0], problems[1], request.agent_count], &self.goals)),
+            log_probs: Some(arrays::from_f32(&problems, &self.log_probs)),
+            costs: Some(arrays::from_f32(&problems, &self.costs)),
+            exact_costs: Some(arrays::from_f32(&problems, &self.exact_costs)),
             version: version.0,
         }
     }
 
     /// Reads the answer to a request: shapes fit, numbers are finite, and goals exist.
     pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, ConvertError> {
-        let b = request.shard.episodes as usize;
+        let problems = [request.shard.episodes as usize, request.stages];
         if message.version != request.shard.version.0 {
             let problem = format!("version {} answered, {} was asked", message.version, request.shard.version);
             return Err(ConvertError::new("version", problem));
         }
-        let goals = arrays::to_u32("goals", message.goals, &[b, request.agent_count])?;
+        let goals = arrays::to_u32("goals", message.goals, &[problems[0], problems[1], request.agent_count])?;
         if let Some(goal) = goals.iter().find(|&&goal| goal as usize >= request.goal_count) {
             return Err(ConvertError::new("goals", format!("{goal} is not below {}", request.goal_count)));
         }
         Ok(Self {
             goals,
-            log_probs: finite("log_probs", arrays::to_f32("log_probs", message.log_probs, &[b])?)?,
-            costs: finite("costs", arrays::to_f32("costs", message.costs, &[b])?)?,
-            exact_costs: finite("exact_costs", arrays::to_f32("exact_costs", message.exact_costs, &[b])?)?,
+            log_probs: finite("log_probs", arrays::to_f32("log_probs", message.log_probs, &problems)?)?,
+            costs: finite("costs", arrays::to_f32("costs", message.costs, &problems)?)?,
+            exact_costs: finite("exact_costs", arrays::to_f32("exact_costs", message.exact_costs, &problems)?)?,
         })
     }
 }
@@ -187,7 +191,7 @@ mod tests {
         };
         let points: Vec<f32> = (0..8).map(|i| i as f32).collect();
         let (seed, scheduler, goals) = (5, SchedulerKind::Exact, points.clone());
-        GoalRequest { shard, seed, scheduler, agent_count: 2, goal_count: 2, dims: 2, agents: points, goals }
+        GoalRequest { shard, seed, scheduler, stages: 1, agent_count: 2, goal_count: 2, dims: 2, agents: points, goals }
     }
 
     #[test]
@@ -201,7 +205,7 @@ mod tests {
             costs: vec![2.0, 3.0],
             exact_costs: vec![2.0, 2.5],
         };
-        let message = reply.to_message(2, 2, WeightsVersion(1));
+        let message = reply.to_message(&request(), WeightsVersion(1));
         assert_eq!(GoalReply::from_message(message.clone(), &request()).unwrap(), reply);
         let other = v1::AssignBatchResponse { version: 2, ..message };
         assert!(GoalReply::from_message(other, &request()).unwrap_err().to_string().contains("version 2 answered"));

@@ -284,10 +284,9 @@ impl TaskConfig {
     pub fn stages(&self) -> &'static [Stage] {
         match self.name {
             TaskName::SimpleSpread | TaskName::Drones => &[Stage { from: Group::Agents, to: Group::Landmarks }],
-            TaskName::PushBall => &[
-                Stage { from: Group::Agents, to: Group::Balls },
-                Stage { from: Group::Balls, to: Group::Landmarks },
-            ],
+            TaskName::PushBall => {
+                &[Stage { from: Group::Agents, to: Group::Balls }, Stage { from: Group::Balls, to: Group::Landmarks }]
+            }
         }
     }
 

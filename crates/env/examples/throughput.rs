@@ -5,11 +5,14 @@
 // An example's output is its purpose.
 #![allow(clippy::print_stdout)]
 
+use magex_core::task::{Spawn, TaskConfig, TaskName};
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let seconds = match std::env::args().nth(1) {
         Some(word) => word.parse()?,
         None => 1.0,
     };
+    println!("simple-spread");
     println!("{:>6} {:>8} {:>16} {:>16} {:>16}", "agents", "worlds", "joint steps/s", "steps only, f32", "f64");
     for (agents, worlds) in [(5, 256), (20, 64), (50, 32), (100, 16), (200, 16), (300, 1), (1000, 1), (5000, 1)] {
         let all = magex_env::bench::throughput(agents, worlds, seconds)?;
@@ -19,6 +22,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         } else {
             println!("{agents:>6} {worlds:>8} {all:>16.0}");
         }
+    }
+    println!("push-ball");
+    println!("{:>6} {:>8} {:>16}", "agents", "worlds", "joint steps/s");
+    for (agents, worlds) in [(5, 256), (20, 64), (50, 32), (100, 16), (200, 16), (1000, 1)] {
+        let task = TaskConfig::of(TaskName::PushBall, agents, Spawn::Uniform);
+        println!("{agents:>6} {worlds:>8} {:>16.0}", magex_env::bench::throughput_of(&task, worlds, seconds)?);
     }
     println!("{:>6} {:>8} {:>22} {:>22}", "drones", "episodes", "commands/s, random", "piloted");
     for (drones, episodes) in [(1, 64), (2, 64), (4, 64), (8, 32)] {

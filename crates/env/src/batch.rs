@@ -1,10 +1,10 @@
-//! B worlds of N agents, W to a block: state, step, reward and bookkeeping.
+//! Simple Spread on B worlds, W to a block: goals, reward and bookkeeping.
 
 use crate::arrival::{Arrivals, View};
-use crate::cells::Cells;
-use crate::physics::{Alike, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use crate::physics::{Alike, Pair, Physics};
 use crate::real::Real;
 use crate::spread::{CONTACT_DISTANCE, COVER_RADIUS};
+use crate::swarm::Swarm;
 use magex_core::task::{RewardConfig, TaskConfig};
 
 /// Coefficients of the reward in the physics' scalar.
@@ -33,24 +33,12 @@ fn square<R: Real>(x: R) -> R {
     x * x
 }
 
-/// The worlds. Array element `[block · N + i][w]` belongs to agent i of world block · W + w; the lanes of the last block
-/// that have no world hold agents far apart, at rest.
+/// The worlds and what Simple Spread makes of them; arrays are laid out like those of [`Swarm`].
 #[derive(Debug, Clone)]
 pub(crate) struct Batch<R, const W: usize> {
-    worlds: usize,
     agents: usize,
-    physics: Physics<R>,
-    bodies: Alike<R>,
+    swarm: Swarm<R, W, Alike<R>>,
     law: RewardLaw<R>,
-    x: Vec<[R; W]>,
-    y: Vec<[R; W]>,
-    vx: Vec<[R; W]>,
-    vy: Vec<[R; W]>,
-    /// Contact forces and overlaps at the present positions: the reward after a step and the motion of the next one
-    /// share one look at the pairs.
-    fx: Vec<[R; W]>,
-    fy: Vec<[R; W]>,
-    hits: Vec<[R; W]>,
     /// Where each agent's goal is.
     gx: Vec<[R; W]>,
     gy: Vec<[R; W]>,
@@ -60,11 +48,7 @@ pub(crate) struct Batch<R, const W: usize> {
     /// `[blocks]` sums over agents and steps.
     reward_sum: Vec<[f64; W]>,
     hit_sum: Vec<[f64; W]>,
-    /// Large worlds (W = 1) compare neighbours only.
-    cells: Option<Cells<R>>,
-    pairs: Pairs,
-    /// `[N]` one block's actions and rewards, lanes innermost.
-    actions: Vec<[u8; W]>,
+    /// `[N]` one block's rewards, lanes innermost.
     rewards: Vec<[R; W]>,
 }
 
@@ -78,55 +62,23 @@ impl<R: Real, const W: usize> Batch<R, W> {
         with_cells: bool,
     ) -> Self {
         let agents = task.agents;
-        let worlds = landmarks.len() / (2 * agents);
-        let blocks = worlds.div_ceil(W);
-        let physics = Physics::standard();
-        let pair = Pair::equal(&physics, CONTACT_DISTANCE);
+        let kinds = Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE));
+        let cells_over = with_cells.then_some(f64::from(task.side));
+        let swarm = Swarm::new(kinds, (agents, agents), positions, velocities, cells_over);
+        let blocks = swarm.worlds().div_ceil(W);
         let law = RewardLaw::new(&task.reward);
-        let zero = vec![[R::ZERO; W]; blocks * agents];
-        let mut batch = Self {
-            worlds,
+        Self {
             agents,
-            physics,
-            bodies: Alike(pair),
+            gx: vec![[R::ZERO; W]; blocks * agents],
+            gy: vec![[R::ZERO; W]; blocks * agents],
+            arrivals: Arrivals::new(swarm.worlds(), agents, law.cover2, &landmarks),
+            swarm,
             law,
-            x: (0..blocks * agents).map(|k| [R::from_f64((k % agents) as f64); W]).collect(),
-            y: zero.clone(),
-            vx: zero.clone(),
-            vy: zero.clone(),
-            fx: zero.clone(),
-            fy: zero.clone(),
-            hits: zero.clone(),
-            gx: zero.clone(),
-            gy: zero,
-            arrivals: Arrivals::new(worlds, agents, law.cover2, &landmarks),
             landmarks,
             reward_sum: vec![[0.0; W]; blocks],
             hit_sum: vec![[0.0; W]; blocks],
-            cells: (with_cells && W == 1).then(|| {
-                let reach = physics.reach(pair.touch).to_f64();
-                Cells::new(agents, f64::from(task.side), reach)
-            }),
-            pairs: Vec::new(),
-            actions: vec![[0; W]; agents],
             rewards: vec![[R::ZERO; W]; agents],
-        };
-        for world in 0..worlds {
-            for i in 0..agents {
-                let from = 2 * (world * agents + i);
-                let (k, w) = batch.place(world, i);
-                (batch.x[k][w], batch.y[k][w]) = (positions[from], positions[from + 1]);
-                (batch.vx[k][w], batch.vy[k][w]) = (velocities[from], velocities[from + 1]);
-            }
         }
-        for block in 0..blocks {
-            batch.find_contacts(block);
-        }
-        batch
-    }
-
-    fn place(&self, world: usize, agent: usize) -> (usize, usize) {
-        (world / W * self.agents + agent, world % W)
     }
 
     /// `goals` is `[B, N]`, checked.
@@ -134,7 +86,7 @@ impl<R: Real, const W: usize> Batch<R, W> {
         for (k, &goal) in goals.iter().enumerate() {
             let (world, i) = (k / self.agents, k % self.agents);
             let from = 2 * (world * self.agents + goal as usize);
-            let (k, w) = self.place(world, i);
+            let (k, w) = self.swarm.place(world, i);
             (self.gx[k][w], self.gy[k][w]) = (self.landmarks[from], self.landmarks[from + 1]);
         }
     }
@@ -144,63 +96,17 @@ impl<R: Real, const W: usize> Batch<R, W> {
         let per_block = self.agents * W;
         let blocks = actions.chunks(per_block).zip(rewards.chunks_mut(per_block)).enumerate();
         for (block, (actions, rewards)) in blocks {
-            self.advance(block, actions);
-            self.find_contacts(block);
+            self.swarm.step(block, actions);
             self.pay(block, rewards);
             self.observe(block, step, rewards.len() / self.agents);
         }
     }
 
-    /// Moves a block's agents.
-    fn advance(&mut self, block: usize, actions: &[u8]) {
-        for (w, world) in actions.chunks_exact(self.agents).enumerate() {
-            for (lanes, &action) in self.actions.iter_mut().zip(world) {
-                lanes[w] = action;
-            }
-        }
-        let n = block * self.agents..(block + 1) * self.agents;
-        let mut motion = Motion {
-            x: &mut self.x[n.clone()],
-            y: &mut self.y[n.clone()],
-            vx: &mut self.vx[n.clone()],
-            vy: &mut self.vy[n.clone()],
-        };
-        let forces = (&self.fx[n.clone()], &self.fy[n]);
-        let (u, actions) = (self.physics.sensitivity, &self.actions);
-        motion.advance(&self.physics, &self.bodies, forces, |i| {
-            // Plain loops without branches: what the compiler turns into vectors.
-            let (mut ux, mut uy) = ([R::ZERO; W], [R::ZERO; W]);
-            let a = &actions[i];
-            for w in 0..W {
-                ux[w] = u * R::from_i8(i8::from(a[w] == 1) - i8::from(a[w] == 2));
-                uy[w] = u * R::from_i8(i8::from(a[w] == 3) - i8::from(a[w] == 4));
-            }
-            (ux, uy)
-        });
-    }
-
-    /// Contact forces and overlaps at the present positions of a block.
-    fn find_contacts(&mut self, block: usize) {
-        let n = block * self.agents..(block + 1) * self.agents;
-        let positions = (&self.x[n.clone()], &self.y[n.clone()]);
-        let mut forces = Forces { x: &mut self.fx[n.clone()], y: &mut self.fy[n.clone()], hits: &mut self.hits[n] };
-        // Both ways list the pairs in the same order, so that they give the same bits.
-        let found = match &mut self.cells {
-            None => find_pairs(&self.bodies, positions, &mut self.pairs),
-            Some(cells) => {
-                cells.sort(positions.0.as_flattened(), positions.1.as_flattened());
-                cells.pairs(self.bodies.0.reach2, &mut self.pairs);
-                self.pairs.len()
-            }
-        };
-        forces.sum(&self.physics, &self.bodies, positions, &self.pairs[..found]);
-    }
-
     /// Rewards of a block at the present positions.
     fn pay(&mut self, block: usize, rewards: &mut [R]) {
-        let n = block * self.agents..(block + 1) * self.agents;
-        let (x, y) = (&self.x[n.clone()], &self.y[n.clone()]);
-        let (gx, gy, hits) = (&self.gx[n.clone()], &self.gy[n.clone()], &self.hits[n]);
+        let n = self.swarm.block(block);
+        let (x, y) = (&self.swarm.x[n.clone()], &self.swarm.y[n.clone()]);
+        let (gx, gy, hits) = (&self.gx[n.clone()], &self.gy[n.clone()], &self.swarm.hits[n]);
         let law = self.law;
         let (mut reward_sum, mut hit_sum) = ([R::ZERO; W], [R::ZERO; W]);
         for (i, lanes) in self.rewards.iter_mut().enumerate() {
@@ -226,19 +132,19 @@ impl<R: Real, const W: usize> Batch<R, W> {
     }
 
     fn observe(&mut self, block: usize, step: u32, worlds: usize) {
-        let n = block * self.agents..(block + 1) * self.agents;
+        let n = self.swarm.block(block);
         let from = 2 * block * W * self.agents;
         let view = View {
-            x: &self.x[n.clone()],
-            y: &self.y[n],
+            x: &self.swarm.x[n.clone()],
+            y: &self.swarm.y[n],
             landmarks: &self.landmarks[from..from + 2 * worlds * self.agents],
-            cells: self.cells.as_ref(),
+            cells: self.swarm.cells.as_ref(),
         };
         self.arrivals.observe(block, step, &view);
     }
 
     pub(crate) fn worlds(&self) -> usize {
-        self.worlds
+        self.swarm.worlds()
     }
 
     pub(crate) fn landmarks(&self) -> &[R] {
@@ -247,22 +153,12 @@ impl<R: Real, const W: usize> Batch<R, W> {
 
     /// Writes `[B, N, 2]`.
     pub(crate) fn write_positions(&self, out: &mut [R]) {
-        self.interleave(&self.x, &self.y, out);
+        self.swarm.write_positions(out);
     }
 
     /// Writes `[B, N, 2]`.
     pub(crate) fn write_velocities(&self, out: &mut [R]) {
-        self.interleave(&self.vx, &self.vy, out);
-    }
-
-    fn interleave(&self, x: &[[R; W]], y: &[[R; W]], out: &mut [R]) {
-        for (world, out) in out.chunks_exact_mut(2 * self.agents).enumerate() {
-            let (from, w) = self.place(world, 0);
-            let lanes = x[from..from + self.agents].iter().zip(&y[from..from + self.agents]);
-            for (out, (x, y)) in out.chunks_exact_mut(2).zip(lanes) {
-                (out[0], out[1]) = (x[w], y[w]);
-            }
-        }
+        self.swarm.write_velocities(out);
     }
 
     /// Step of arrival of a world, if it has arrived.
@@ -279,14 +175,14 @@ impl<R: Real, const W: usize> Batch<R, W> {
     pub(crate) fn near(&self, world: usize) -> Vec<Vec<u32>> {
         // Agents in groups that fill a register; the last group is filled up with agents out of everything's reach.
         const GROUP: usize = 16;
-        let (from, w) = self.place(world, 0);
+        let (from, w) = self.swarm.place(world, 0);
         let groups = |lanes: &[[R; W]]| -> Vec<[R; GROUP]> {
             let mut groups = vec![[R::from_f64(1e30); GROUP]; self.agents.div_ceil(GROUP)];
             let places = groups.as_flattened_mut().iter_mut();
             places.zip(&lanes[from..from + self.agents]).for_each(|(place, lanes)| *place = lanes[w]);
             groups
         };
-        let (x, y) = (groups(&self.x), groups(&self.y));
+        let (x, y) = (groups(&self.swarm.x), groups(&self.swarm.y));
         let near = |point: &[R]| {
             let mut agents = Vec::new();
             for (group, (x, y)) in x.iter().zip(&y).enumerate() {

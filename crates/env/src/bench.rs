@@ -2,7 +2,7 @@
 
 use crate::batch::Batch;
 use crate::drones::{Drones, scripted_drones};
-use crate::env::{Env as _, View};
+use crate::env::{Env as _, View, new_env};
 use crate::error::EnvError;
 use crate::real::Real;
 use crate::spread::{LANES, Spread};
@@ -13,26 +13,34 @@ use std::time::Instant;
 /// Joint steps in the table of random actions.
 const TABLE: usize = 64;
 
-/// Joint steps per second of one core: `worlds` episodes of N agents, random actions from a keyed table, spawned
-/// anew and scored at every horizon; contacts, collisions, rewards and arrival included. Runs for about `seconds`.
+/// Joint steps per second of one core in Simple Spread: [`throughput_of`] the paper's task for N agents.
 pub fn throughput(agents: usize, worlds: usize, seconds: f64) -> Result<f64, EnvError> {
-    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
-    let table = random_actions(agents * worlds);
-    let mut rewards = vec![0.0; agents * worlds];
-    let goals: Vec<u32> = (0..worlds).flat_map(|_| 0..agents as u32).collect();
+    throughput_of(&TaskConfig::simple_spread(agents, Spawn::Uniform), worlds, seconds)
+}
+
+/// Joint steps per second of one core: `worlds` episodes of a task, random actions from a keyed table, spawned anew and
+/// scored at every horizon; contacts, collisions, rewards and arrival included. Runs for about `seconds`.
+pub fn throughput_of(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f64, EnvError> {
+    let shape = task.shape(worlds);
+    let table = random_actions(worlds * shape.agents * shape.heads, task.action_heads()[0] as u32);
+    let mut rewards = vec![0.0; worlds * shape.agents];
+    // Every agent goes for what has its own number.
+    let goals: Vec<u32> = (0..worlds)
+        .flat_map(|_| (0..shape.agents as u32).flat_map(|agent| std::iter::repeat_n(agent, shape.targets)))
+        .collect();
     let (start, mut joint_steps, mut round) = (Instant::now(), 0u64, 0);
     loop {
         let streams = (0..worlds as u32).map(|world| Key::new(1, Purpose::Bench, &[1, round, world]).stream());
-        let mut spread = Spread::new(&task, streams)?;
-        spread.set_goals(&goals)?;
+        let mut env = new_env(task, streams, false)?;
+        env.set_goals(&goals)?;
         for step in 0..task.horizon as usize {
-            spread.step(&table[step % TABLE], &mut rewards)?;
+            env.step(&table[step % TABLE], &mut rewards)?;
             joint_steps += worlds as u64;
             if step % TABLE == 0 && start.elapsed().as_secs_f64() >= seconds {
                 return Ok(joint_steps as f64 / start.elapsed().as_secs_f64());
             }
         }
-        std::hint::black_box(spread.scores());
+        std::hint::black_box(env.scores());
         round += 1;
     }
 }
@@ -86,7 +94,7 @@ pub fn precisions(agents: usize, worlds: usize, seconds: f64) -> Result<[f64; 2]
     let streams = (0..worlds as u32).map(|world| Key::new(1, Purpose::Bench, &[1, 0, world]).stream());
     let spread = Spread::new(&task, streams)?;
     let (positions, landmarks) = (spread.positions(), spread.landmarks());
-    let table = random_actions(agents * worlds);
+    let table = random_actions(agents * worlds, 5);
     Ok([
         steps_only::<f32>(&task, &positions, landmarks, &table, seconds),
         steps_only::<f64>(&task, &positions, landmarks, &table, seconds),
@@ -118,7 +126,7 @@ fn steps_only<R: Real>(
     }
 }
 
-fn random_actions(numbers: usize) -> Vec<Vec<u8>> {
+fn random_actions(numbers: usize, choices: u32) -> Vec<Vec<u8>> {
     let mut stream = Key::new(1, Purpose::Bench, &[2]).stream();
-    (0..TABLE).map(|_| (0..numbers).map(|_| stream.below(5) as u8).collect()).collect()
+    (0..TABLE).map(|_| (0..numbers).map(|_| stream.below(choices) as u8).collect()).collect()
 }

@@ -2,6 +2,7 @@
 
 use crate::drones::Drones;
 use crate::error::EnvError;
+use crate::push_ball::PushBall;
 use crate::spread::Spread;
 use magex_core::rng::Stream;
 use magex_core::task::{TaskConfig, TaskName};
@@ -67,11 +68,8 @@ pub fn new_env(
 ) -> Result<Box<dyn Env>, EnvError> {
     Ok(match task.name {
         TaskName::SimpleSpread => Box::new(Spread::new(task, streams)?),
+        TaskName::PushBall => Box::new(PushBall::new(task, streams, training)?),
         TaskName::Drones => Box::new(Drones::new(task, streams)?),
-        TaskName::PushBall => {
-            let _ = training;
-            return Err(EnvError::Task(format!("task.name: {} is not built in", task.name)));
-        }
     })
 }
 

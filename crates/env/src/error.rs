@@ -1,6 +1,6 @@
 //! What a caller of the environment can get wrong.
 
-/// Errors of [`crate::Spread`]. An error leaves the worlds untouched.
+/// Errors of an [`crate::Env`]. An error leaves the worlds untouched.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EnvError {
@@ -36,12 +36,22 @@ pub enum EnvError {
     /// A goal names a landmark that does not exist.
     #[error("goals[{place}]: {goal} is not a landmark; use an index below {landmarks}")]
     Goal {
-        /// Flat index into `[B, N]`.
+        /// Flat index into `[B, N, K]`.
         place: usize,
         /// The value found there.
         goal: u32,
         /// N.
         landmarks: usize,
+    },
+    /// A goal names a ball that does not exist.
+    #[error("goals[{place}]: {goal} is not a ball; use an index below {balls}")]
+    Ball {
+        /// Flat index into `[B, N, 2]`.
+        place: usize,
+        /// The value found there.
+        goal: u32,
+        /// N.
+        balls: usize,
     },
     /// A position, velocity or landmark is not a finite number.
     #[error("{field}[{place}]: {value} is not finite")]
@@ -75,4 +85,14 @@ pub(crate) fn check_finite(field: &'static str, values: &[f32]) -> Result<(), En
         None => Ok(()),
         Some(place) => Err(EnvError::NotFinite { field, place, value: values[place] }),
     }
+}
+
+/// `Ok` if every action is one of the five thrusts.
+pub(crate) fn check_actions(actions: &[u8]) -> Result<(), EnvError> {
+    // The maximum first: it vectorises, the search does not.
+    if actions.iter().fold(0, |most, &action| most.max(action)) <= 4 {
+        return Ok(());
+    }
+    let place = actions.iter().position(|&action| action > 4).unwrap_or_default();
+    Err(EnvError::Action { place, action: actions[place] })
 }

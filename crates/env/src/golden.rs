@@ -12,7 +12,7 @@ mod reader;
 mod recording;
 mod replay;
 
-pub use recording::{Body, Frame, Recording};
+pub use recording::{Body, Frame, Recording, Scenario};
 
 /// Why a recording cannot be checked.
 #[derive(Debug, thiserror::Error)]
@@ -28,7 +28,7 @@ pub enum GoldenError {
         found: String,
     },
     /// The recording is of a task this crate does not simulate.
-    #[error("scenario: '{found}' is not supported; use a recording of scenario spread")]
+    #[error("scenario: '{found}' is not supported; use a recording of scenario spread or push_ball")]
     UnsupportedScenario {
         /// What the file says it is.
         found: String,

@@ -140,13 +140,35 @@ impl Curve {
 
     /// n equally spaced points in the authors' order: both ends of a segment, a circle ending at angle π.
     pub fn even(self, n: usize) -> impl Iterator<Item = [f64; 2]> {
+        (0..n).map(move |k| self.at(self.even_arc(k, n)))
+    }
+
+    /// Arc length at which the k-th of n equally spaced points is.
+    fn even_arc(self, k: usize, n: usize) -> f64 {
         let length = self.length();
-        (0..n).map(move |k| {
-            self.at(match self {
-                Self::Segment { .. } if n == 1 => 0.5 * length,
-                Self::Segment { .. } => length * k as f64 / (n - 1) as f64,
-                Self::Circle { .. } => length * (k + 1) as f64 / n as f64,
-            })
+        match self {
+            Self::Segment { .. } if n == 1 => 0.5 * length,
+            Self::Segment { .. } => length * k as f64 / (n - 1) as f64,
+            Self::Circle { .. } => length * (k + 1) as f64 / n as f64,
+        }
+    }
+
+    /// The k-th of n equally spaced points, moved along the curve by up to `share` of the way to its neighbours, and by no
+    /// more than leaves moved neighbours `spacing` apart; the ends of a segment move inwards.
+    pub fn jittered(self, (k, n): (usize, usize), share: f64, spacing: f64, stream: &mut Stream) -> [f64; 2] {
+        let (length, even) = (self.length(), self.even_arc(k, n));
+        let (gaps, spacing) = match self {
+            Self::Segment { .. } => (n.saturating_sub(1).max(1), spacing),
+            Self::Circle { radius } => (n, arc_of(spacing, radius)),
+        };
+        let gap = length / gaps as f64;
+        let most = (share * gap).min(0.5 * (gap - spacing)).max(0.0);
+        let arc = even + stream.range(-most, most);
+        self.at(match self {
+            Self::Circle { .. } => arc,
+            Self::Segment { .. } if arc < 0.0 => -arc,
+            Self::Segment { .. } if arc > length => 2.0 * length - arc,
+            Self::Segment { .. } => arc,
         })
     }
 
@@ -161,9 +183,7 @@ impl Curve {
         let (gaps, spacing, start) = match self {
             Self::Segment { .. } => (n.saturating_sub(1), spacing, 0.0),
             // The chord of two neighbours, not their arc, is to be `spacing`; a circle has no first point.
-            Self::Circle { radius } => {
-                (n, 2.0 * radius * libm::asin((0.5 * spacing / radius).min(1.0)), stream.range(0.0, length))
-            }
+            Self::Circle { radius } => (n, arc_of(spacing, radius), stream.range(0.0, length)),
         };
         let spacing = if gaps == 0 { 0.0 } else { spacing.min(length / gaps as f64) };
         let cell = (length - spacing * gaps as f64) / n.max(1) as f64;
@@ -171,12 +191,17 @@ impl Curve {
     }
 }
 
+/// The arc of a circle over a chord.
+fn arc_of(chord: f64, radius: f64) -> f64 {
+    2.0 * radius * libm::asin((0.5 * chord / radius).min(1.0))
+}
+
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// "x y" per line.
-    fn file(name: &str) -> Vec<[f64; 2]> {
+    pub(crate) fn file(name: &str) -> Vec<[f64; 2]> {
         let path = format!("{}/testdata/maps/{name}", env!("CARGO_MANIFEST_DIR"));
         let text = std::fs::read_to_string(&path).unwrap();
         let number = |word: &str| word.parse::<f64>().unwrap();

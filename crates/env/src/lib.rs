@@ -11,6 +11,7 @@ pub mod bench;
 pub mod drones;
 pub mod golden;
 pub mod layouts;
+pub mod push_ball;
 pub mod scripted;
 pub mod spawn;
 
@@ -23,9 +24,11 @@ mod matching;
 mod physics;
 mod real;
 mod spread;
+mod swarm;
 
 pub use drones::{Drones, scripted_drones};
 pub use env::{Env, Score, View, new_env};
 pub use error::EnvError;
+pub use push_ball::PushBall;
 pub use real::Real;
 pub use spread::{CONTACT_DISTANCE, COVER_RADIUS, Spread};

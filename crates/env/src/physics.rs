@@ -53,7 +53,7 @@ impl<R: Real> Physics<R> {
 pub(crate) struct Pair<R> {
     /// Sum of the radii.
     pub(crate) touch: R,
-    /// touch²; the pair overlaps below it.
+    /// touch²; the pair counts as a hit below it. Negative if it never counts.
     pub(crate) touch2: R,
     /// reach²; no force from it on. Negative if the two never touch.
     pub(crate) reach2: R,
@@ -80,6 +80,8 @@ pub(crate) trait Bodies<R> {
     fn inverse_mass(&self, i: usize) -> R;
     /// Whether the body moves at all.
     fn movable(&self, i: usize) -> bool;
+    /// The largest reach² of any pair.
+    fn reach2(&self) -> R;
 }
 
 /// Bodies of one size and mass 1: the agents of Simple Spread.
@@ -98,6 +100,47 @@ impl<R: Real> Bodies<R> for Alike<R> {
     #[inline(always)]
     fn movable(&self, _: usize) -> bool {
         true
+    }
+    #[inline(always)]
+    fn reach2(&self) -> R {
+        self.0.reach2
+    }
+}
+
+/// Agents, then balls, all of mass 1: the bodies of Push Ball.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AgentsAndBalls<R> {
+    agents: usize,
+    /// Agent and agent, agent and ball, ball and ball.
+    pairs: [Pair<R>; 3],
+}
+
+impl<R: Real> AgentsAndBalls<R> {
+    /// `agents` agents, followed by balls; only agents that overlap with each other count as hits.
+    pub(crate) fn new(physics: &Physics<R>, agents: usize, agent_radius: f64, ball_radius: f64) -> Self {
+        let pair = |touch| Pair::equal(physics, touch);
+        let uncounted = |touch| Pair { touch2: -R::ONE, ..pair(touch) };
+        let pairs = [pair(2.0 * agent_radius), uncounted(agent_radius + ball_radius), uncounted(2.0 * ball_radius)];
+        Self { agents, pairs }
+    }
+}
+
+impl<R: Real> Bodies<R> for AgentsAndBalls<R> {
+    #[inline(always)]
+    fn pair(&self, i: usize, j: usize) -> Pair<R> {
+        self.pairs[usize::from(i >= self.agents) + usize::from(j >= self.agents)]
+    }
+    #[inline(always)]
+    fn inverse_mass(&self, _: usize) -> R {
+        R::ONE
+    }
+    #[inline(always)]
+    fn movable(&self, _: usize) -> bool {
+        true
+    }
+    #[inline(always)]
+    fn reach2(&self) -> R {
+        self.pairs.iter().fold(R::ZERO, |most, pair| if pair.reach2 > most { pair.reach2 } else { most })
     }
 }
 
@@ -144,7 +187,7 @@ pub(crate) fn find_pairs<R: Real, const W: usize, B: Bodies<R>>(
 pub(crate) struct Forces<'a, R, const W: usize> {
     pub(crate) x: &'a mut [[R; W]],
     pub(crate) y: &'a mut [[R; W]],
-    /// Other bodies strictly closer than the sum of radii.
+    /// Other bodies strictly closer than the sum of radii, as far as they count ([`Pair::touch2`]).
     pub(crate) hits: &'a mut [[R; W]],
 }
 

@@ -1,9 +1,27 @@
-//! A hand-written controller: what an agent that knows its goal can reach without learning.
+//! Hand-written controllers: what an agent that knows its goals can reach without learning.
 
+mod push_ball;
+
+use crate::drones::scripted_drones;
+use crate::env::View;
 use crate::error::{EnvError, check_len};
 use crate::physics::Physics;
+use magex_core::task::{TaskConfig, TaskName};
 
-/// Chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
+/// The controller of a task: one action [N, H] per joint state, along the axes of the world.
+pub fn scripted(task: &TaskConfig, view: &View<'_>, out: &mut [u8]) -> Result<(), EnvError> {
+    match task.name {
+        TaskName::SimpleSpread => {
+            scripted_actions(view.positions, view.velocities, view.landmarks, view.goals, task.agents, out)
+        }
+        TaskName::PushBall => scripted_push_ball(view, task.agents, out),
+        TaskName::Drones => scripted_drones(view, task.agents, out),
+    }
+}
+
+pub use push_ball::scripted_push_ball;
+
+/// Simple Spread: chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
 ///
 /// With v' the velocity after the action, the agent moves by dt · v' now and then coasts by
 /// dt · v' · keep / (1 − keep) = 3 dt · v', so it stops at p + 0.4 v'. Ties go to the lower action.

@@ -2,7 +2,7 @@
 
 use crate::batch::Batch;
 use crate::env::{Env, Score};
-use crate::error::{EnvError, check_finite, check_len};
+use crate::error::{EnvError, check_actions, check_finite, check_len};
 use crate::matching::maximum_matching;
 use crate::spawn;
 use magex_core::rng::Stream;
@@ -212,10 +212,7 @@ impl Env for Spread {
         if self.steps >= self.horizon {
             return Err(EnvError::EpisodeOver { horizon: self.horizon });
         }
-        if actions.iter().fold(0, |most, &action| most.max(action)) > 4 {
-            let place = actions.iter().position(|&action| action > 4).unwrap_or_default();
-            return Err(EnvError::Action { place, action: actions[place] });
-        }
+        check_actions(actions)?;
         self.steps += 1;
         match &mut self.worlds {
             Worlds::Lanes(batch) => batch.step(self.steps, actions, rewards),

@@ -4,62 +4,18 @@
 // Helpers of tests; the lint's exception covers test functions only.
 #![allow(clippy::unwrap_used)]
 
+mod assign;
+
+use assign::exact;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_env::Spread;
 use magex_env::scripted::scripted_actions;
 use magex_env::{Env as _, Score};
 
-/// Exact assignment by shortest augmenting paths; `cost` is [n, n], the result maps rows to columns.
-fn assign(cost: &[f64], n: usize) -> Vec<u32> {
-    // One-based potentials and matching with column 0 as the root of each search.
-    let (mut u, mut v) = (vec![0.0; n + 1], vec![0.0; n + 1]);
-    let (mut row_of, mut way) = (vec![0; n + 1], vec![0; n + 1]);
-    for row in 1..=n {
-        row_of[0] = row;
-        let mut column = 0;
-        let (mut slack, mut used) = (vec![f64::INFINITY; n + 1], vec![false; n + 1]);
-        while row_of[column] != 0 {
-            used[column] = true;
-            let (i, mut delta, mut next) = (row_of[column], f64::INFINITY, 0);
-            for j in (1..=n).filter(|&j| !used[j]) {
-                let reduced = cost[(i - 1) * n + j - 1] - u[i] - v[j];
-                if reduced < slack[j] {
-                    (slack[j], way[j]) = (reduced, column);
-                }
-                if slack[j] < delta {
-                    (delta, next) = (slack[j], j);
-                }
-            }
-            for j in 0..=n {
-                if used[j] {
-                    u[row_of[j]] += delta;
-                    v[j] -= delta;
-                } else {
-                    slack[j] -= delta;
-                }
-            }
-            column = next;
-        }
-        while column != 0 {
-            row_of[column] = row_of[way[column]];
-            column = way[column];
-        }
-    }
-    let mut columns = vec![0; n];
-    (1..=n).for_each(|j| columns[row_of[j] - 1] = j as u32 - 1);
-    columns
-}
-
 fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> {
     let worlds = positions.chunks_exact(2 * agents).zip(landmarks.chunks_exact(2 * agents));
-    let solve = |(agents_at, landmarks_at): (&[f32], &[f32])| {
-        let distance = |a: &[f32], b: &[f32]| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]));
-        let rows = agents_at.chunks_exact(2);
-        let cost: Vec<f64> = rows.flat_map(|a| landmarks_at.chunks_exact(2).map(move |b| distance(a, b))).collect();
-        assign(&cost, agents)
-    };
-    worlds.flat_map(solve).collect()
+    worlds.flat_map(|(agents, landmarks)| exact(agents, landmarks)).collect()
 }
 
 fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<Score> {

@@ -4,14 +4,20 @@ use crate::curve::{curve_svg, parse_metrics};
 use crate::replay::{ReplayEpisode, ReplayInfo, replay_html};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
+use magex_core::task::TaskName;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use std::path::{Path, PathBuf};
 
 /// One line that says what a run is.
 pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
+    let name = match task.name {
+        TaskName::SimpleSpread => "Simple Spread",
+        TaskName::PushBall => "Push Ball",
+        TaskName::Drones => "Drones",
+    };
     format!(
-        "Simple Spread, N = {}, {} · executor {} · scheduler {commander} · seed {}",
+        "{name}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
         task.agents, task.spawn, config.executor.kind, config.run.seed
     )
 }
@@ -32,7 +38,7 @@ pub(crate) fn write_replay(
     config: &RunConfig,
     episodes: &[(Recording, Option<EpisodeMetrics>)],
 ) -> anyhow::Result<PathBuf> {
-    let info = ReplayInfo::simple_spread(title, subtitle, config.task.side);
+    let info = ReplayInfo::of(&config.task, title, subtitle);
     let named: Vec<ReplayEpisode<'_>> = episodes
         .iter()
         .enumerate()

@@ -114,7 +114,7 @@ impl Variation {
             Controller::Learned => Roller::new(config, weights)?,
             Controller::Scripted => Roller::scripted(config)?,
         };
-        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)? })
+        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)?, random_share: 0.0 })
     }
 
     /// The scheduler that hands out goals.

@@ -12,7 +12,6 @@
 use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
-use magex_core::task::TaskName;
 use magex_learner::checkpoint::{self, CheckpointError, Learned, sha256_hex};
 use magex_learner::commander::CommanderPpo;
 use magex_learner::mappo::Mappo;
@@ -27,10 +26,7 @@ pub(crate) const WEIGHTS: &str = "weights.safetensors";
 
 /// `runs/<task>-<N>-<executor>-s<seed>`, or the same with -2, -3, … if there is such a folder.
 pub(crate) fn default_out(config: &RunConfig, exists: impl Fn(&Path) -> bool) -> PathBuf {
-    let task = match config.task.name {
-        TaskName::SimpleSpread => "simple-spread",
-    };
-    let name = format!("{task}-{}-{}-s{}", config.task.agents, config.executor.kind, config.run.seed);
+    let name = format!("{}-{}-{}-s{}", config.task.name, config.task.agents, config.executor.kind, config.run.seed);
     let first = Path::new("runs").join(&name);
     if !exists(&first) {
         return first;
@@ -123,8 +119,7 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
     }
     let template = Learned {
         executor: Mappo::new(config)?.start()?,
-        commander: CommanderPpo::new(&config.commander, config.task.agents, config.task.dims(), config.run.seed)
-            .start()?,
+        commander: CommanderPpo::new(&config.commander, &config.task, config.run.seed).start()?,
     };
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));

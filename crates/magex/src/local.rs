@@ -20,18 +20,24 @@ pub struct Crew {
     pub roller: Roller,
     /// Hands out the goals.
     pub commander: Commander,
+    /// Share of the training episodes with random goals.
+    pub random_share: f32,
 }
 
 impl Crew {
     /// From a weights file; `scheduler` overrides the configured one with a classical one.
     pub fn new(config: &RunConfig, weights: &[u8], scheduler: Option<CommanderKind>) -> Result<Self, ParamError> {
-        Ok(Self { roller: Roller::new(config, weights)?, commander: commander(config, weights, scheduler)? })
+        Ok(Self {
+            roller: Roller::new(config, weights)?,
+            commander: commander(config, weights, scheduler)?,
+            random_share: config.commander.random_share,
+        })
     }
 
     /// Rolls out one shard.
     pub fn work(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
         self.roller
-            .rollout(shard, |request| answer(&self.commander, request))
+            .rollout(shard, |request| answer(&self.commander, self.random_share, request))
             .map_err(|e| CollectError::Shard { shard: *shard, reason: e.to_string() })
     }
 

@@ -4,6 +4,7 @@ use crate::logging::set_live_line;
 use crate::output::{colours, note, share, thousands};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
+use magex_core::task::TaskName;
 use magex_learner::collector::RunEvent;
 use serde::Deserialize;
 use std::io::IsTerminal as _;
@@ -21,7 +22,9 @@ struct Row {
     sampled_success_rate: Option<f64>,
     arrival_step: Option<f64>,
     collisions_per_agent_step: Option<f64>,
+    collision_rate: Option<f64>,
     cost_ratio: Option<f64>,
+    second_cost_ratio: Option<f64>,
     timing: Shares,
     joint_steps_per_s: f64,
     wall_s: f64,
@@ -49,6 +52,8 @@ pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     rows: u32,
     target: f64,
+    /// Agents of the task can crash.
+    crashes: bool,
     colours: bool,
     last_iteration: Option<Instant>,
 }
@@ -57,11 +62,12 @@ impl Progress {
     /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
+        let crashes = config.task.name == TaskName::Drones;
         let terminal = std::io::stderr().is_terminal();
         if !terminal {
             tracing::info!(
                 out,
-                task = "simple-spread",
+                task = %config.task.name,
                 agents = config.task.agents,
                 spawn = %config.task.spawn,
                 executor = %config.executor.kind,
@@ -71,7 +77,7 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, colours: false, last_iteration: None };
+            return Self { bar: None, rows: 0, target, crashes, colours: false, last_iteration: None };
         }
         let colours = colours();
         let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
@@ -85,7 +91,7 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, colours, last_iteration: None }
+        Self { bar: Some(bar), rows: 0, target, crashes, colours, last_iteration: None }
     }
 
     /// Something happened.
@@ -134,7 +140,9 @@ impl Progress {
                 sampled_success = row.sampled_success_rate.map(rounded),
                 arrival_step = row.arrival_step.map(rounded),
                 collisions_per_agent_step = row.collisions_per_agent_step.map(rounded),
+                collision_rate = row.collision_rate.filter(|_| self.crashes).map(rounded),
                 cost_ratio = row.cost_ratio.map(rounded),
+                second_cost_ratio = row.second_cost_ratio.map(rounded),
                 steps_per_s = row.joint_steps_per_s.round(),
                 collect_percent = collect.round(),
                 update_percent = update.round(),
@@ -145,12 +153,12 @@ impl Progress {
             return;
         };
         if self.rows.is_multiple_of(PAGE) {
-            let heading = heading();
+            let heading = heading(self.crashes);
             note(if self.colours { format!("\x1b[2m{heading}\x1b[0m") } else { heading });
         }
         self.rows += 1;
         let reached = row.success_rate.is_some_and(|success| success >= self.target);
-        note(line(row, [collect, update, commander, checkpoint], reached && self.colours));
+        note(line(row, [collect, update, commander, checkpoint], self.crashes, reached && self.colours));
         bar.set_position(row.joint_env_steps);
         let next = if row.sampled_success_rate.is_none() {
             "closing evaluation".into()
@@ -167,7 +175,7 @@ impl Drop for Progress {
     }
 }
 
-fn heading() -> String {
+fn heading(crashes: bool) -> String {
     format!(
         "{:>5} {:>10} {:>8} {:>8} {:>8} {:>10} {:>7} {:>8}  {}",
         "iter",
@@ -175,14 +183,14 @@ fn heading() -> String {
         "success",
         "sampled",
         "arrival",
-        "collisions",
+        if crashes { "crashed" } else { "collisions" },
         "cost",
         "steps/s",
         "time: collect update commander"
     )
 }
 
-fn line(row: &Row, percent: [f64; 4], highlight: bool) -> String {
+fn line(row: &Row, percent: [f64; 4], crashes: bool, highlight: bool) -> String {
     let cell = |value: Option<f64>, show: &dyn Fn(f64) -> String| value.map_or_else(|| "-".to_owned(), show);
     let success = format!("{:>8}", cell(row.success_rate, &share));
     let success = if highlight { format!("\x1b[32m{success}\x1b[0m") } else { success };
@@ -198,7 +206,7 @@ fn line(row: &Row, percent: [f64; 4], highlight: bool) -> String {
         thousands(row.joint_env_steps as f64),
         cell(row.sampled_success_rate, &share),
         cell(row.arrival_step, &|x| format!("{x:.1}")),
-        cell(row.collisions_per_agent_step, &|x| format!("{x:.4}")),
+        cell(row.collision_rate.filter(|_| crashes).or(row.collisions_per_agent_step), &|x| format!("{x:.4}")),
         cell(row.cost_ratio, &|x| format!("{x:.4}")),
     )
 }
@@ -219,12 +227,12 @@ mod tests {
             "timing":{"collect_s":3.0,"executor_s":6.0,"commander_s":1.0,"checkpoint_s":0.0},
             "joint_steps_per_s":1234.5,"wall_s":9.0}"#;
         let row: Row = serde_json::from_str(json).unwrap();
-        let text = line(&row, row.timing.percent(), false);
+        let text = line(&row, row.timing.percent(), false, false);
         assert_eq!(
             text,
             "   12     11,520   0.9999   0.9700     61.2     0.0123  1.0004    1,234           30 %   60 %      10 %"
         );
-        let heading = heading();
+        let heading = heading(false);
         assert_eq!(heading.find("success").unwrap() + 7, text.find("0.9999").unwrap() + 6);
         assert_eq!(heading.len(), "    iter".len() - 3 + text.len() - 5);
     }
@@ -235,6 +243,6 @@ mod tests {
             "arrival_step":null,"collisions_per_agent_step":null,"cost_ratio":null,
             "timing":{"collect_s":0,"executor_s":0,"commander_s":0,"checkpoint_s":0},"joint_steps_per_s":0,"wall_s":1}"#;
         let row: Row = serde_json::from_str(json).unwrap();
-        assert!(line(&row, row.timing.percent(), true).contains(" - "));
+        assert!(line(&row, row.timing.percent(), false, true).contains(" - "));
     }
 }

@@ -57,15 +57,12 @@ pub trait Network: Send + Sync {
     fn memory(&self) -> usize;
 }
 
-/// What features the executor of a run wants.
+/// What features the executor of a run wants. The graph executors see single neighbours where the task has encounters.
 pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
-    FeatureSpec {
-        dims: task.dims(),
-        targets: 1,
-        half_side: task.side / 2.0,
-        relative_goal: config.kind != ExecutorKind::MagexLiteral,
-        neighbours: if config.kind == ExecutorKind::Local { config.neighbours } else { 0 },
-    }
+    let local = config.kind == ExecutorKind::Local;
+    let literal = config.kind == ExecutorKind::MagexLiteral;
+    let neighbours = if local || (task.observation().encounters && !literal) { config.neighbours } else { 0 };
+    FeatureSpec::new(task, !literal, neighbours, !local)
 }
 
 /// H of the executor's memory, without building it.

@@ -2,201 +2,272 @@
 //!
 //! Everything is free of translation where it can be, and its scale does not depend on the team size, so that weights
 //! trained with 50 agents serve 20 or 1000. Rows are ordered [.., N]: the N agents of a joint state are neighbours.
+//!
+//! What a task is, [`Observation`] says in numbers; no formula here knows a task by name.
 
-/// Joint states to compute features of: S of them, N agents each.
+mod goal;
+mod neighbours;
+mod symmetry;
+
+use magex_core::task::{Frame, Observation, TaskConfig};
+
+pub use symmetry::Symmetry;
+
+/// Joint states to compute features of: S of them, N agents each. Landmarks and goals are those of Q episodes, and state s
+/// belongs to episode s modulo Q.
 #[derive(Debug, Clone, Copy)]
 pub struct JointStates<'a> {
-    /// N.
-    pub agents: usize,
-    /// D: 2 or 3.
-    pub dims: usize,
-    /// K: targets per agent.
-    pub targets_per_agent: usize,
-    /// [S, N, D] world units.
+    /// [S, E, D] world units.
     pub positions: &'a [f32],
-    /// [S, N, D] world units per second.
+    /// [S, E, D] world units per second.
     pub velocities: &'a [f32],
-    /// [S, N, K, D] positions of the targets.
-    pub targets: &'a [f32],
+    /// [S, N, X]
+    pub extras: &'a [f32],
+    /// [Q, G, D] world units.
+    pub landmarks: &'a [f32],
+    /// [Q, N, K]; see [`TaskConfig::stages`].
+    pub goals: &'a [u32],
 }
 
 /// What a network wants to see.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FeatureSpec {
-    /// Space dimensions.
+    /// N.
+    pub agents: usize,
+    /// Moving bodies that are not agents.
+    pub balls: usize,
+    /// G: landmarks.
+    pub landmarks: usize,
+    /// D: 2 or 3.
     pub dims: usize,
-    /// Targets per agent.
+    /// X: further numbers of an agent's state.
+    pub extras: usize,
+    /// K: targets per agent.
     pub targets: usize,
     /// Half side of the map: the unit of absolute positions.
     pub half_side: f32,
     /// Goal positions relative to the agent (ours), or absolute (literal reading of the paper).
     pub relative_goal: bool,
-    /// Nearest neighbours of the `local` executor; 0 for none.
+    /// Nearest neighbours that an agent sees one by one; 0 for none.
     pub neighbours: usize,
+    /// Node and pair features, which the graph executors read.
+    pub team: bool,
+    /// Sizes that the features are measured with.
+    pub observation: Observation,
 }
-
-/// Terminal speed of an agent: 2 units per second (0.1 · 5 / 0.25 of the physics).
-const SPEED: f32 = 2.0;
-/// Within this distance the direction to a goal fades, so that it has no jump at the goal.
-const NEAR: f32 = 0.3;
-/// Neighbours farther than this do not matter to the `local` executor.
-const REACH: f32 = 1.0;
-/// Distance at which a goal counts as reached.
-const REACHED: f32 = 0.15;
-/// Diameter of an agent.
-const DIAMETER: f32 = 0.2;
 
 /// Features of R = S·N agents.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Features {
-    /// [R, node_width]: absolute position / half side, velocity / 2.
+    /// [R, node_width]: absolute position / half side, velocity / speed, further state, offset to the ball.
     pub nodes: Vec<f32>,
     /// [R, 2D]: position and velocity in metric units, for differences between pairs.
     pub pairs: Vec<f32>,
     /// [R, goal_width]
     pub goals: Vec<f32>,
-    /// [R, k, 2D + 1] offset, relative velocity, closeness.
+    /// [R, k, neighbour_width] offset, relative velocity, closeness, closest approach, kind.
     pub neighbours: Vec<f32>,
     /// `[R]` how many of the k are real.
     pub counts: Vec<u8>,
+    /// `[R]` the frame that each agent sees the world in; empty if that is the world's own.
+    pub symmetries: Vec<Symmetry>,
 }
 
 impl FeatureSpec {
+    /// What a network with these wishes sees of a task.
+    pub fn new(task: &TaskConfig, relative_goal: bool, neighbours: usize, team: bool) -> Self {
+        let observation = task.observation();
+        Self {
+            agents: task.agents,
+            balls: task.balls(),
+            landmarks: task.agents,
+            dims: task.dims(),
+            extras: task.extras(),
+            targets: task.stages().len(),
+            half_side: task.side / 2.0,
+            relative_goal,
+            neighbours,
+            team,
+            // The letter of the paper knows no frame but the world's.
+            observation: if relative_goal { observation } else { Observation { frame: Frame::World, ..observation } },
+        }
+    }
+
     /// Width of a node's features.
     pub fn node_width(&self) -> usize {
-        2 * self.dims
+        2 * self.dims + self.extras + if self.pushes() { self.dims } else { 0 }
     }
 
     /// Width of an agent's goal features.
     pub fn goal_width(&self) -> usize {
-        if self.relative_goal { self.dims + self.targets * (2 * self.dims + 1) } else { (2 + self.targets) * self.dims }
+        self.extras
+            + match (self.relative_goal, self.pushes()) {
+                (false, _) => (2 + self.targets) * self.dims,
+                (true, false) => self.dims + self.targets * (2 * self.dims + 1),
+                (true, true) => goal::push_width(self.dims),
+            }
     }
 
     /// Width of one neighbour's features.
     pub fn neighbour_width(&self) -> usize {
-        2 * self.dims + 1
+        let approach = if self.observation.encounters { self.dims + 2 } else { 0 };
+        2 * self.dims + 1 + approach + usize::from(self.balls > 0)
+    }
+
+    /// Whether an agent's way leads to a ball and with it to a landmark.
+    fn pushes(&self) -> bool {
+        self.balls > 0 && self.targets == 2
+    }
+
+    /// E.
+    fn bodies(&self) -> usize {
+        self.agents + self.balls
     }
 
     /// Features of all agents of all states.
     pub fn compute(&self, states: &JointStates<'_>) -> Features {
-        let rows = states.positions.len() / self.dims;
+        let (n, d, joint) = (self.agents, self.dims, self.bodies() * self.dims);
+        let count = states.positions.len() / joint;
+        let episodes = states.goals.len() / (n * self.targets);
         let mut out = Features::default();
-        out.goals.reserve(rows * self.goal_width());
-        for r in 0..rows {
-            self.goal_features(states, r, &mut out.goals);
+        out.goals.reserve(count * n * self.goal_width());
+        if self.neighbours > 0 {
+            out.neighbours = vec![0.0; count * n * self.neighbours * self.neighbour_width()];
+            out.counts = vec![0; count * n];
         }
-        if self.neighbours == 0 {
-            let (p_scale, v_scale) = (1.0 / self.half_side, 1.0 / SPEED);
-            out.nodes.reserve(rows * 2 * self.dims);
-            out.pairs.reserve(rows * 2 * self.dims);
-            for (p, v) in states.positions.chunks_exact(self.dims).zip(states.velocities.chunks_exact(self.dims)) {
-                out.nodes.extend(p.iter().map(|x| x * p_scale));
-                out.nodes.extend(v.iter().map(|x| x * v_scale));
-                out.pairs.extend(p);
-                out.pairs.extend(v.iter().map(|x| x * v_scale));
+        if self.team {
+            out.nodes.reserve(count * n * self.node_width());
+            out.pairs.reserve(count * n * 2 * d);
+        }
+        let (mut symmetries, mut near) = (Vec::with_capacity(n), Vec::with_capacity(self.neighbours + 1));
+        for s in 0..count {
+            let episode = s % episodes;
+            let state = State {
+                p: &states.positions[s * joint..(s + 1) * joint],
+                v: &states.velocities[s * joint..(s + 1) * joint],
+                extras: &states.extras[s * n * self.extras..(s + 1) * n * self.extras],
+                landmarks: &states.landmarks[episode * self.landmarks * d..(episode + 1) * self.landmarks * d],
+                goals: &states.goals[episode * n * self.targets..(episode + 1) * n * self.targets],
+                dims: d,
+                agents: n,
+                targets: self.targets,
+            };
+            symmetries.clear();
+            symmetries.extend((0..n).map(|i| self.symmetry(&state, i)));
+            for i in 0..n {
+                self.goal_features(&state, i, symmetries[i], &mut out.goals);
             }
-        } else {
-            let width = self.neighbours * self.neighbour_width();
-            out.neighbours = vec![0.0; rows * width];
-            out.counts = vec![0; rows];
-            let joint = states.agents * self.dims;
-            let mut near = Vec::with_capacity(states.agents);
-            for s in 0..rows / states.agents {
+            if self.neighbours > 0 {
+                let width = n * self.neighbours * self.neighbour_width();
                 self.neighbour_features(
-                    &states.positions[s * joint..(s + 1) * joint],
-                    &states.velocities[s * joint..(s + 1) * joint],
+                    &state,
+                    &symmetries,
                     &mut near,
-                    &mut out.neighbours[s * states.agents * width..(s + 1) * states.agents * width],
-                    &mut out.counts[s * states.agents..(s + 1) * states.agents],
+                    &mut out.neighbours[s * width..(s + 1) * width],
+                    &mut out.counts[s * n..(s + 1) * n],
                 );
+            }
+            if self.team {
+                self.team_features(&state, &mut out);
+            }
+            if self.observation.frame != Frame::World {
+                out.symmetries.extend_from_slice(&symmetries);
             }
         }
         out
     }
 
-    fn goal_features(&self, states: &JointStates<'_>, r: usize, out: &mut Vec<f32>) {
-        let d = self.dims;
-        let p = &states.positions[r * d..(r + 1) * d];
-        let v = &states.velocities[r * d..(r + 1) * d];
-        let targets = &states.targets[r * self.targets * d..(r + 1) * self.targets * d];
-        out.extend(v.iter().map(|x| x / SPEED));
-        if !self.relative_goal {
-            out.extend(p.iter().map(|x| x / self.half_side));
-            out.extend(targets.iter().map(|x| x / self.half_side));
-            return;
-        }
-        for target in targets.chunks_exact(d) {
-            let mut offset = [0.0f32; 3];
-            let mut square = 0.0f32;
-            for k in 0..d {
-                offset[k] = target[k] - p[k];
-                square = offset[k].mul_add(offset[k], square);
+    /// What the graph is made of, along the axes of the world: all agents of a state must see the same space.
+    fn team_features(&self, state: &State<'_>, out: &mut Features) {
+        let (p_scale, v_scale) = (1.0 / self.half_side, 1.0 / self.observation.speed);
+        for i in 0..self.agents {
+            let (p, v) = (state.position(i), state.velocity(i));
+            out.nodes.extend(p.iter().map(|x| x * p_scale));
+            out.nodes.extend(v.iter().map(|x| x * v_scale));
+            out.nodes.extend_from_slice(state.extra(i));
+            if self.pushes() {
+                let (offset, distance) = offset(p, state.target(i, 0));
+                out.nodes.extend(offset[..self.dims].iter().map(|x| x / (1.0 + distance)));
             }
-            let distance = square.sqrt();
-            let (direction, squash) = (1.0 / distance.max(NEAR), 1.0 / (1.0 + distance));
-            out.extend(offset[..d].iter().map(|x| x * direction));
-            out.extend(offset[..d].iter().map(|x| x * squash));
-            out.push(if distance <= REACHED { 1.0 } else { 0.0 });
+            out.pairs.extend(p);
+            out.pairs.extend(v.iter().map(|x| x * v_scale));
         }
     }
 
-    /// The k nearest agents within reach, nearest first, ties by index.
-    fn neighbour_features(
-        &self,
-        p: &[f32],
-        v: &[f32],
-        near: &mut Vec<(f32, usize)>,
-        out: &mut [f32],
-        counts: &mut [u8],
-    ) {
-        let (d, k) = (self.dims, self.neighbours);
-        let agents = p.len() / d;
-        let width = self.neighbour_width();
-        // Agents sorted along x: only those within reach of one another on this axis are looked at.
-        let mut order: Vec<usize> = (0..agents).collect();
-        order.sort_by(|&a, &b| p[a * d].total_cmp(&p[b * d]).then(a.cmp(&b)));
-        for (at, &i) in order.iter().enumerate() {
-            near.clear();
-            let mut look = |j: usize| -> bool {
-                if (p[j * d] - p[i * d]).abs() > REACH {
-                    return false;
-                }
-                let mut square = 0.0f32;
-                for c in 0..d {
-                    let offset = p[j * d + c] - p[i * d + c];
-                    square = offset.mul_add(offset, square);
-                }
-                if square <= REACH * REACH {
-                    // Insertion into a short sorted list.
-                    let place = near.iter().position(|&(s, other)| (square, j) < (s, other)).unwrap_or(near.len());
-                    if place < k {
-                        near.insert(place, (square, j));
-                        near.truncate(k);
-                    }
-                }
-                true
-            };
-            for &j in order[..at].iter().rev() {
-                if !look(j) {
-                    break;
-                }
-            }
-            for &j in &order[at + 1..] {
-                if !look(j) {
-                    break;
-                }
-            }
-            counts[i] = near.len() as u8;
-            for (slot, &(square, j)) in near.iter().enumerate() {
-                let out = &mut out[(i * k + slot) * width..(i * k + slot + 1) * width];
-                for c in 0..d {
-                    out[c] = p[j * d + c] - p[i * d + c];
-                    out[d + c] = (v[j * d + c] - v[i * d + c]) / SPEED;
-                }
-                out[2 * d] = (DIAMETER / square.sqrt().max(1e-6)).min(2.0);
+    /// The frame that agent i sees the world in.
+    fn symmetry(&self, state: &State<'_>, i: usize) -> Symmetry {
+        match self.observation.frame {
+            Frame::World => Symmetry::default(),
+            Frame::Octant => {
+                let last = self.targets - 1;
+                let from = if last == 0 { state.position(i) } else { state.target(i, last - 1) };
+                Symmetry::to_first_octant(offset(from, state.target(i, last)).0)
             }
         }
     }
+}
+
+/// One joint state.
+struct State<'a> {
+    /// [E, D]
+    p: &'a [f32],
+    /// [E, D]
+    v: &'a [f32],
+    /// [N, X]
+    extras: &'a [f32],
+    /// [G, D]
+    landmarks: &'a [f32],
+    /// [N, K]
+    goals: &'a [u32],
+    dims: usize,
+    agents: usize,
+    targets: usize,
+}
+
+impl<'a> State<'a> {
+    fn position(&self, body: usize) -> &'a [f32] {
+        &self.p[body * self.dims..(body + 1) * self.dims]
+    }
+
+    fn velocity(&self, body: usize) -> &'a [f32] {
+        &self.v[body * self.dims..(body + 1) * self.dims]
+    }
+
+    fn extra(&self, agent: usize) -> &'a [f32] {
+        let width = self.extras.len() / self.agents;
+        &self.extras[agent * width..(agent + 1) * width]
+    }
+
+    /// Index of an agent's k-th goal within its group.
+    fn goal(&self, agent: usize, k: usize) -> usize {
+        self.goals[agent * self.targets + k] as usize
+    }
+
+    /// The body that is an agent's k-th target; `None` if that is a landmark, which the last one always is.
+    fn target_body(&self, agent: usize, k: usize) -> Option<usize> {
+        (k + 1 < self.targets).then(|| self.agents + self.goal(agent, k))
+    }
+
+    fn target(&self, agent: usize, k: usize) -> &'a [f32] {
+        match self.target_body(agent, k) {
+            Some(body) => self.position(body),
+            None => {
+                let at = self.goal(agent, k) * self.dims;
+                &self.landmarks[at..at + self.dims]
+            }
+        }
+    }
+}
+
+/// to − from, filled up with zeros, and its length.
+fn offset(from: &[f32], to: &[f32]) -> ([f32; 3], f32) {
+    let mut out = [0.0f32; 3];
+    let mut square = 0.0f32;
+    for (k, (a, b)) in from.iter().zip(to).enumerate() {
+        out[k] = b - a;
+        square = out[k].mul_add(out[k], square);
+    }
+    (out, square.sqrt())
 }
 
 impl Features {
@@ -211,48 +282,9 @@ impl Features {
         copy(&mut self.goals, &other.goals, from, count, rows);
         copy(&mut self.neighbours, &other.neighbours, from, count, rows);
         copy(&mut self.counts, &other.counts, from, count, rows);
+        copy(&mut self.symmetries, &other.symmetries, from, count, rows);
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn spec(neighbours: usize) -> FeatureSpec {
-        FeatureSpec { dims: 2, targets: 1, half_side: 5.0, relative_goal: true, neighbours }
-    }
-
-    #[test]
-    fn goal_features_are_translation_free_and_fade_at_the_goal() {
-        let at = |x: f32, y: f32, gx: f32, gy: f32| {
-            let states = JointStates {
-                agents: 1,
-                dims: 2,
-                targets_per_agent: 1,
-                positions: &[x, y],
-                velocities: &[1.0, 0.0],
-                targets: &[gx, gy],
-            };
-            spec(0).compute(&states).goals
-        };
-        assert_eq!(at(0.0, 0.0, 3.0, 4.0), at(1.0, 2.0, 4.0, 6.0));
-        assert_eq!(at(0.0, 0.0, 3.0, 4.0), vec![0.5, 0.0, 0.6, 0.8, 0.5, 4.0 / 6.0, 0.0]);
-        assert_eq!(at(0.0, 0.0, 0.0, 0.0), vec![0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
-    }
-
-    #[test]
-    fn neighbours_are_the_nearest_within_reach() {
-        let positions = [0.0, 0.0, 0.5, 0.0, 0.0, 0.1, 3.0, 0.0, -0.9, 0.0];
-        let states = JointStates {
-            agents: 5,
-            dims: 2,
-            targets_per_agent: 1,
-            positions: &positions,
-            velocities: &[0.0; 10],
-            targets: &[0.0; 10],
-        };
-        let features = spec(2).compute(&states);
-        assert_eq!(features.counts, [2, 2, 2, 0, 2]);
-        assert_eq!(features.neighbours[..10], [0.0, 0.1, 0.0, 0.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.4]);
-    }
-}
+mod tests;

@@ -4,7 +4,7 @@
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_nets::Activation;
 use magex_nets::executor::{Input, build, feature_spec, memory};
 use magex_nets::features::JointStates;
@@ -142,14 +142,46 @@ fn keyed_noise_is_replayed_and_makes_edges_random() {
     assert_eq!(run(vec![5, 6])[..n * width], run(vec![5, 7])[..n * width]);
 }
 
-fn states(count: usize, agents: usize) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-    let size = count * agents * 2;
-    (normal(size, 1), normal(size, 2), normal(size, 3))
+/// Random joint states of a task.
+struct States {
+    positions: Vec<f32>,
+    velocities: Vec<f32>,
+    extras: Vec<f32>,
+    landmarks: Vec<f32>,
+    goals: Vec<u32>,
 }
 
-fn drawn(kind: ExecutorKind, agents: usize, outputs: usize) -> (ExecutorConfig, TaskConfig, Params) {
+impl States {
+    fn new(task: &TaskConfig, count: usize) -> Self {
+        let s = task.shape(count);
+        let goals = |_| (0..s.agents as u32).flat_map(|i| std::iter::repeat_n(i, s.targets));
+        Self {
+            positions: normal(count * s.bodies * s.dims, 1),
+            velocities: normal(count * s.bodies * s.dims, 2),
+            extras: normal(count * s.agents * s.extras, 4).iter().map(|x| -x.abs()).collect(),
+            landmarks: normal(count * s.landmarks * s.dims, 3),
+            goals: (0..count).flat_map(goals).collect(),
+        }
+    }
+
+    fn part(&self, task: &TaskConfig, from: usize, to: usize) -> JointStates<'_> {
+        let s = task.shape(1);
+        let state = s.bodies * s.dims;
+        JointStates {
+            positions: &self.positions[from * state..to * state],
+            velocities: &self.velocities[from * state..to * state],
+            extras: &self.extras[from * s.agents * s.extras..to * s.agents * s.extras],
+            landmarks: &self.landmarks[from * s.landmarks * s.dims..to * s.landmarks * s.dims],
+            goals: &self.goals[from * s.agents * s.targets..to * s.agents * s.targets],
+        }
+    }
+}
+
+const TASKS: [TaskName; 3] = [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones];
+
+fn drawn(name: TaskName, kind: ExecutorKind, agents: usize, outputs: usize) -> (ExecutorConfig, TaskConfig, Params) {
     let config = ExecutorConfig { kind, neighbours: 3, ..ExecutorConfig::default() };
-    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
+    let task = TaskConfig::of(name, agents, Spawn::Uniform);
     let mut source = Source::new(Key::new(3, Purpose::Init, &[0]).stream());
     build(&config, &feature_spec(&config, &task), agents, outputs, 1.0, &mut source).unwrap();
     match source {
@@ -160,25 +192,19 @@ fn drawn(kind: ExecutorKind, agents: usize, outputs: usize) -> (ExecutorConfig, 
 
 #[test]
 fn every_parameter_of_every_executor_receives_a_gradient() {
-    for kind in [
+    let kinds = [
         ExecutorKind::Magex,
         ExecutorKind::MagexLiteral,
         ExecutorKind::Attention,
         ExecutorKind::Mlp,
         ExecutorKind::Local,
-    ] {
+    ];
+    for (name, kind) in TASKS.into_iter().flat_map(|name| kinds.map(|kind| (name, kind))) {
         let (steps, sequences, agents) = (4, 3, 6);
-        let (config, task, params) = drawn(kind, agents, 5);
+        let (config, task, params) = drawn(name, kind, agents, 5);
         let spec = feature_spec(&config, &task);
-        let (positions, velocities, targets) = states(steps * sequences, agents);
-        let features = spec.compute(&JointStates {
-            agents,
-            dims: 2,
-            targets_per_agent: 1,
-            positions: &positions,
-            velocities: &velocities,
-            targets: &targets,
-        });
+        let states = States::new(&task, steps * sequences);
+        let features = spec.compute(&states.part(&task, 0, steps * sequences));
         let vars = params.variables().unwrap();
         let mut source = params.source(vars.iter().map(|v| v.as_tensor().clone()).collect());
         let net = build(&config, &spec, agents, 5, 1.0, &mut source).unwrap();
@@ -196,36 +222,29 @@ fn every_parameter_of_every_executor_receives_a_gradient() {
         for (entry, v) in params.entries.iter().zip(&vars) {
             let size = grads
                 .get(v)
-                .unwrap_or_else(|| panic!("{kind}: {} has no gradient", entry.name))
+                .unwrap_or_else(|| panic!("{name} {kind}: {} has no gradient", entry.name))
                 .abs()
                 .unwrap()
                 .max_all()
                 .unwrap()
                 .to_scalar::<f32>()
                 .unwrap();
-            assert!(size > 0.0 && size.is_finite(), "{kind}: the gradient of {} is {size}", entry.name);
+            assert!(size > 0.0 && size.is_finite(), "{name} {kind}: the gradient of {} is {size}", entry.name);
         }
     }
 }
 
 #[test]
 fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
-    for kind in [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Mlp, ExecutorKind::Local] {
+    let kinds = [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Mlp, ExecutorKind::Local];
+    for (name, kind) in TASKS.into_iter().flat_map(|name| kinds.map(|kind| (name, kind))) {
         let (count, agents) = (7, 9);
-        let (config, task, params) = drawn(kind, agents, 5);
+        let (config, task, params) = drawn(name, kind, agents, 5);
         let spec = feature_spec(&config, &task);
         let net = build(&config, &spec, agents, 5, 1.0, &mut params.source(params.plain().unwrap())).unwrap();
-        let (positions, velocities, targets) = states(count, agents);
+        let states = States::new(&task, count);
         let run = |from: usize, to: usize| {
-            let (a, b) = (from * agents * 2, to * agents * 2);
-            let features = spec.compute(&JointStates {
-                agents,
-                dims: 2,
-                targets_per_agent: 1,
-                positions: &positions[a..b],
-                velocities: &velocities[a..b],
-                targets: &targets[a..b],
-            });
+            let features = spec.compute(&states.part(&task, from, to));
             let input = Input {
                 steps: 1,
                 sequences: to - from,
@@ -238,7 +257,7 @@ fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
         };
         let all = run(0, count);
         for s in 0..count {
-            assert_eq!(run(s, s + 1), all[s * agents * 5..(s + 1) * agents * 5], "{kind}, state {s}");
+            assert_eq!(run(s, s + 1), all[s * agents * 5..(s + 1) * agents * 5], "{name} {kind}, state {s}");
         }
     }
 }

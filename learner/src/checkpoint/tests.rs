@@ -11,7 +11,7 @@ fn learned() -> Learned {
         ..RunConfig::default()
     };
     let executor = Mappo::new(&config).unwrap().start().unwrap();
-    let commander = CommanderPpo::new(&config.commander, 5, 2, 1).start().unwrap();
+    let commander = CommanderPpo::new(&config.commander, &config.task, 1).start().unwrap();
     Learned { executor, commander }
 }
 

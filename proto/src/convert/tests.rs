@@ -24,33 +24,47 @@ fn floats(count: usize) -> impl Strategy<Value = Vec<f32>> {
 }
 
 fn metrics(count: usize) -> impl Strategy<Value = Vec<EpisodeMetrics>> {
-    let one = (prop::array::uniform5(finite()), any::<u32>()).prop_map(|(x, arrival_step)| EpisodeMetrics {
+    let one = (prop::array::uniform8(finite()), any::<u32>()).prop_map(|(x, arrival_step)| EpisodeMetrics {
         success: x[0],
         matched_success: x[1],
         arrival_step,
         collisions_per_agent_step: x[2],
         reward: x[3],
         cost_ratio: x[4],
+        second_cost_ratio: (x[5] > 0.0).then_some(x[5]),
+        spawn_success: x[6],
+        collision_rate: x[7],
     });
     prop::collection::vec(one, count)
 }
 
 fn trajectories() -> impl Strategy<Value = Trajectory> {
-    (shards(), [1usize..4, 1..4, 1..4, 1..4, 1..3]).prop_flat_map(|(shard, [t, n, extra, d, k])| {
+    (shards(), [1usize..4, 1..4, 0..4, 1..4, 1..3]).prop_flat_map(|(shard, [t, n, extra, d, k])| {
         let b = shard.episodes as usize;
         let (e, h) = (n + extra, k);
-        let shape = Shape { steps: t, episodes: b, agents: n, bodies: e, landmarks: n, dims: d, targets: k, heads: h };
+        let shape = Shape {
+            steps: t,
+            episodes: b,
+            agents: n,
+            bodies: e,
+            landmarks: n,
+            dims: d,
+            extras: extra,
+            targets: k,
+            heads: h,
+        };
         let state = (t + 1) * b * e * d;
-        let states = (floats(state), floats(state), floats(b * n * d));
+        let states = (floats(state), floats(state), floats(b * n * d), floats((t + 1) * b * n * extra));
         let choices =
             (prop::collection::vec(any::<u32>(), b * n * k), prop::collection::vec(any::<u8>(), t * b * n * h));
-        let numbers = (floats(t * b * n), floats(t * b * n), floats(b), floats(b), floats(b));
+        let numbers = (floats(t * b * n), floats(t * b * n), floats(b * k), floats(b * k), floats(b * k));
         (states, choices, numbers, metrics(b)).prop_map(move |(states, choices, numbers, metrics)| Trajectory {
             shard,
             shape,
             positions: states.0,
             velocities: states.1,
             landmarks: states.2,
+            extras: states.3,
             goals: choices.0,
             actions: choices.1,
             log_probs: numbers.0,
@@ -82,8 +96,8 @@ proptest! {
 
     #[test]
     fn an_evaluation_round_trips(shard in shards(), metrics in metrics(3), points in floats(3 * 2 * 2)) {
-        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, targets: 1, heads: 1 };
-        let recording = Recording { shape, landmarks: points[..4].to_vec(), positions: points, goals: vec![1, 0] };
+        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, extras: 0, targets: 1, heads: 1 };
+        let recording = Recording { shape, landmarks: points[..4].to_vec(), positions: points, extras: vec![], goals: vec![1, 0] };
         let outcome = ShardResult::Eval(EvalOutcome { shard, metrics, recording: shard.record.then_some(recording) });
         prop_assert_eq!(decode_result(encode_result(&RunId("r".into()), "abc", &outcome)).unwrap().result, outcome);
     }
@@ -105,7 +119,17 @@ fn a_wrong_field_is_named_by_its_path() {
     };
     assert_eq!(encode(shard, v1::Trajectory::default()), "trajectory.shape: missing");
     assert_eq!(encode(v1::Shard { mode: 9, ..shard }, v1::Trajectory::default()), "shard.mode: not set or unknown");
-    let shape = v1::Shape { steps: 1, episodes: 1, agents: 1, bodies: 1, landmarks: 1, dims: 2, targets: 1, heads: 1 };
+    let shape = v1::Shape {
+        steps: 1,
+        episodes: 1,
+        agents: 1,
+        bodies: 1,
+        landmarks: 1,
+        dims: 2,
+        extras: 0,
+        targets: 1,
+        heads: 1,
+    };
     let body = v1::Trajectory {
         shape: Some(shape),
         positions: Some(arrays::from_f32(&[2, 1, 1, 3], &[0.0; 6])),

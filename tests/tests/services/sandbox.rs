@@ -61,13 +61,16 @@ pub(crate) fn plan(iteration: u32, shards: u32) -> Vec<Shard> {
 /// What a shard's result is, whoever computes it.
 pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> ShardResult {
     let (t, b, n) = (task.horizon as usize, shard.episodes as usize, task.agents);
-    let shape = Shape { steps: t, episodes: b, agents: n, bodies: n, landmarks: n, dims: 2, targets: 1, heads: 1 };
+    let shape = task.shape(b);
     let tag = weights.iter().map(|&byte| u32::from(byte)).sum();
     let mut stream = Key::new(SEED, Purpose::Action, &[shard.iteration.0, shard.index, tag]).stream();
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| stream.uniform32()).collect() };
     let metrics = EpisodeMetrics {
         success: 1.0,
         matched_success: 1.0,
+        spawn_success: 0.0,
+        collision_rate: 0.0,
+        second_cost_ratio: None,
         arrival_step: 1,
         collisions_per_agent_step: 0.0,
         reward: 0.5,
@@ -78,6 +81,7 @@ pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> Sha
         shape,
         positions: numbers((t + 1) * b * n * 2),
         velocities: numbers((t + 1) * b * n * 2),
+        extras: vec![],
         landmarks: numbers(b * n * 2),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
@@ -209,7 +213,7 @@ pub(crate) fn goal_request(task: &TaskConfig, shard: &Shard) -> GoalRequest {
     let points: Vec<f32> = (0..b * n * 2).map(|i| i as f32).collect();
     let (shard, agents, goals) = (*shard, points.clone(), points);
     let scheduler = SchedulerKind::Learned;
-    GoalRequest { shard, seed: SEED, scheduler, agent_count: n, goal_count: n, dims: 2, agents, goals }
+    GoalRequest { shard, seed: SEED, scheduler, stages: 1, agent_count: n, goal_count: n, dims: 2, agents, goals }
 }
 
 impl Worker for FakeWorker {
@@ -339,7 +343,8 @@ pub(crate) struct FakeScheduler;
 
 impl Scheduler for FakeScheduler {
     fn assign_batch(&self, request: &GoalRequest) -> Result<GoalReply, AssignError> {
-        let (b, n) = (request.shard.episodes as usize, request.agent_count as u32);
+        let b = request.shard.episodes as usize * request.stages;
+        let n = request.agent_count as u32;
         let goals = (0..b).flat_map(|_| 0..n).collect();
         Ok(GoalReply { goals, log_probs: vec![-1.0; b], costs: vec![2.0; b], exact_costs: vec![1.0; b] })
     }

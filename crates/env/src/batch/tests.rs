@@ -1,4 +1,6 @@
 use super::*;
+use crate::cells::Cells;
+use crate::physics::Pairs;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
 

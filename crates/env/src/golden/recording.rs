@@ -5,10 +5,10 @@ use super::reader::Field;
 
 /// Most bodies and steps a recording may have: far beyond any, small enough that sizes cannot overflow.
 const MOST: usize = 1_000_000;
-/// Most agents, so that a pair of them can be named by 32 bits.
-const MOST_AGENTS: usize = 1 << 16;
+/// Most agents, and balls, so that a pair of them can be named by 32 bits.
+const MOST_AGENTS: usize = 1 << 15;
 
-/// An agent or a landmark.
+/// An agent, a ball or a landmark.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Body {
     /// Radius in world units.
@@ -24,9 +24,9 @@ pub struct Body {
 /// The bodies' state after a step, and what the authors' code said about it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// `[N + G]` agents, then landmarks.
+    /// `[N + balls + G]` agents, then balls, then landmarks.
     pub positions: Vec<[f64; 2]>,
-    /// `[N + G]`
+    /// `[N + balls + G]`
     pub velocities: Vec<[f64; 2]>,
     /// `[N]`
     pub rewards: Vec<f64>,
@@ -36,7 +36,24 @@ pub struct Frame {
     pub overlaps: usize,
 }
 
-/// One recorded episode of Simple Spread.
+/// Which task was recorded, and what only its recordings have.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Scenario {
+    /// Simple Spread.
+    Spread {
+        /// `[N]` landmark of each agent.
+        goals: Vec<usize>,
+        /// Unit of the distances in the reward.
+        distance_unit: f64,
+    },
+    /// Push Ball.
+    PushBall {
+        /// `[N]` ball and landmark of each agent.
+        goals: Vec<[usize; 2]>,
+    },
+}
+
+/// One recorded episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
     /// Its name.
@@ -53,14 +70,14 @@ pub struct Recording {
     pub sensitivity: f64,
     /// Direction of each action.
     pub directions: [[f64; 2]; 5],
-    /// `[N]`
-    pub agents: Vec<Body>,
+    /// N.
+    pub agents: usize,
+    /// `[N + balls]` everything that forces act on: agents, then balls.
+    pub bodies: Vec<Body>,
     /// `[G]`
     pub landmarks: Vec<Body>,
-    /// `[N]` landmark of each agent.
-    pub goals: Vec<usize>,
-    /// Unit of the distances in the reward.
-    pub distance_unit: f64,
+    /// Which task it is.
+    pub scenario: Scenario,
     /// `[T][N]`
     pub actions: Vec<Vec<u8>>,
     /// `[T + 1]` frame t is the state before step t.
@@ -79,17 +96,22 @@ impl Recording {
             return Err(GoldenError::Format { found: format.to_owned() });
         }
         let scenario = root.get("scenario")?.text()?;
-        if scenario != "spread" {
-            return Err(GoldenError::UnsupportedScenario { found: scenario.to_owned() });
-        }
+        let pushing = match scenario {
+            "spread" => false,
+            "push_ball" => true,
+            _ => return Err(GoldenError::UnsupportedScenario { found: scenario.to_owned() }),
+        };
         let n = root.get("n_agents")?.index(MOST_AGENTS)?;
         let g = root.get("n_landmarks")?.index(MOST)?;
         let steps = root.get("T")?.index(MOST)?;
-        root.get("n_balls")?.index(1)?;
-        if n == 0 || g == 0 {
-            return Err(root.get(if n == 0 { "n_agents" } else { "n_landmarks" })?.wrong("must be at least 1"));
+        let balls = root.get("n_balls")?.index(if pushing { MOST_AGENTS } else { 1 })?;
+        for (count, name) in [(n, "n_agents"), (g, "n_landmarks"), (balls, "n_balls")] {
+            if count == 0 && (pushing || name != "n_balls") {
+                return Err(root.get(name)?.wrong("must be at least 1"));
+            }
         }
-        let bodies = Self::bodies(&root.get("entities")?, n, g)?;
+        let mut bodies = Self::bodies(&root.get("entities")?, [n, balls, g])?;
+        let landmarks = bodies.split_off(n + balls);
         let meta = root.get("meta")?;
         if meta.get("max_speed").is_ok_and(|speed| !speed.is_null()) {
             return Err(meta.get("max_speed")?.wrong("is not supported; must be null"));
@@ -102,12 +124,19 @@ impl Recording {
             contact_margin: meta.get("contact_margin")?.positive()?,
             sensitivity: meta.get("action_sensitivity")?.number()?,
             directions: Self::directions(&meta.get("action_uxuy")?)?,
-            landmarks: bodies[n..].to_vec(),
-            agents: bodies[..n].to_vec(),
-            goals: root.get("goal")?.each(n, |goal| goal.index(g))?,
-            distance_unit: root.get("al_max_dis")?.positive()?,
+            scenario: if pushing {
+                let ball = root.get("ball_of_agent")?.each(n, |ball| ball.index(balls))?;
+                let landmark = root.get("land_of_agent")?.each(n, |landmark| landmark.index(g))?;
+                Scenario::PushBall { goals: ball.into_iter().zip(landmark).map(|(b, l)| [b, l]).collect() }
+            } else {
+                let goals = root.get("goal")?.each(n, |goal| goal.index(g))?;
+                Scenario::Spread { goals, distance_unit: root.get("al_max_dis")?.positive()? }
+            },
+            agents: n,
+            bodies,
+            landmarks,
             actions: root.get("actions")?.each(steps, |step| step.each(n, |a| Ok(a.index(5)? as u8)))?,
-            frames: Self::frames(&root, n, g, steps)?,
+            frames: Self::frames(&root, (n, n + balls + g), steps)?,
             divergence: root.get("divergence_1e-12")?.each(steps, Field::number)?,
         })
     }
@@ -121,11 +150,16 @@ impl Recording {
         Ok(directions)
     }
 
-    fn bodies<'a>(field: &Field<'a>, n: usize, g: usize) -> Result<Vec<Body>, GoldenError> {
+    fn bodies<'a>(field: &Field<'a>, [n, balls, g]: [usize; 3]) -> Result<Vec<Body>, GoldenError> {
         let read = |(k, body): (usize, Field<'a>)| {
-            let (kind, expected) = (body.get("kind")?, if k < n { "agent" } else { "landmark" });
+            let expected = match k {
+                _ if k < n => "agent",
+                _ if k < n + balls => "ball",
+                _ => "landmark",
+            };
+            let kind = body.get("kind")?;
             if kind.text()? != expected {
-                return Err(kind.wrong(format!("must be '{expected}': agents come first, then landmarks")));
+                return Err(kind.wrong(format!("must be '{expected}': agents come first, then balls, then landmarks")));
             }
             let body = Body {
                 size: body.get("size")?.positive()?,
@@ -135,15 +169,15 @@ impl Recording {
             };
             Ok((body, kind))
         };
-        let bodies: Vec<_> = field.list(n + g)?.enumerate().map(read).collect::<Result<_, _>>()?;
-        if let Some((_, kind)) = bodies[n..].iter().find(|(body, _)| body.movable || body.collide) {
-            return Err(kind.wrong("a landmark of scenario spread neither moves nor collides"));
+        let bodies: Vec<_> = field.list(n + balls + g)?.enumerate().map(read).collect::<Result<_, _>>()?;
+        if let Some((_, kind)) = bodies[n + balls..].iter().find(|(body, _)| body.movable || body.collide) {
+            return Err(kind.wrong("a landmark neither moves nor collides"));
         }
         Ok(bodies.into_iter().map(|(body, _)| body).collect())
     }
 
-    fn frames(root: &Field<'_>, n: usize, g: usize, steps: usize) -> Result<Vec<Frame>, GoldenError> {
-        let points = |field: &Field<'_>| field.points(n + g);
+    fn frames(root: &Field<'_>, (n, all): (usize, usize), steps: usize) -> Result<Vec<Frame>, GoldenError> {
+        let points = |field: &Field<'_>| field.points(all);
         let numbers = |field: &Field<'_>| field.each(n, Field::number);
         let first = Frame {
             positions: points(&root.get("init_pos")?)?,

@@ -1,14 +1,17 @@
 //! Runs a recording's bodies through the kernels of the rollouts and compares.
 
 use super::MpeReport;
-use super::recording::{Body, Frame, Recording};
-use crate::physics::{Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use super::recording::{Body, Frame, Recording, Scenario};
+use crate::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use crate::push_ball::{AGENT_RADIUS, BALL_RADIUS};
 use crate::real::Real;
+use crate::spread::CONTACT_DISTANCE;
 
 /// Worlds side by side: the recorded states of as many steps.
 const LANES: usize = 8;
 
 /// Bodies of any size and mass.
+#[derive(Clone)]
 struct Mixed<R> {
     bodies: Vec<Body>,
     physics: Physics<R>,
@@ -36,14 +39,19 @@ impl<R: Real> Bodies<R> for Mixed<R> {
     fn movable(&self, i: usize) -> bool {
         self.bodies[i].movable
     }
+
+    fn reach2(&self) -> R {
+        let radius = self.bodies.iter().map(|body| body.size).fold(0.0, f64::max);
+        Pair::equal(&self.physics, 2.0 * radius).reach2
+    }
 }
 
-/// N agents in W worlds, and a step of them.
+/// The bodies in W worlds, and a step of them.
 struct World<'a, R, const W: usize, B> {
     recording: &'a Recording,
     physics: Physics<R>,
     bodies: B,
-    /// x, y, vx, vy: `[N][W]` each.
+    /// x, y, vx, vy: `[bodies][W]` each.
     state: [Vec<[R; W]>; 4],
     forces: [Vec<[R; W]>; 3],
     pairs: Pairs,
@@ -51,7 +59,7 @@ struct World<'a, R, const W: usize, B> {
 
 impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
     fn new(recording: &'a Recording, physics: Physics<R>, bodies: B) -> Self {
-        let zero = || vec![[R::ZERO; W]; recording.agents.len()];
+        let zero = || vec![[R::ZERO; W]; recording.bodies.len()];
         Self {
             recording,
             physics,
@@ -64,7 +72,7 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
 
     /// Puts world `w` into a recorded state.
     fn load(&mut self, w: usize, frame: &Frame) {
-        for i in 0..self.recording.agents.len() {
+        for i in 0..self.recording.bodies.len() {
             let [x, y] = frame.positions[i];
             let [vx, vy] = frame.velocities[i];
             for (lanes, value) in self.state.iter_mut().zip([x, y, vx, vy]) {
@@ -83,6 +91,9 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
         let recording = self.recording;
         let control = |i: usize| {
             let (mut ux, mut uy) = ([R::ZERO; W], [R::ZERO; W]);
+            if i >= recording.agents {
+                return (ux, uy);
+            }
             for w in 0..W {
                 let [dx, dy] = recording.directions[usize::from(recording.actions[steps[w]][i])];
                 ux[w] = self.physics.sensitivity * R::from_f64(dx);
@@ -96,7 +107,7 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
     /// Largest difference of world `w` from a frame: positions, velocities; divided by max(1, |recorded|) if `relative`.
     fn error(&self, w: usize, frame: &Frame, relative: bool) -> [f64; 2] {
         let mut worst = [0.0; 2];
-        for i in 0..self.recording.agents.len() {
+        for i in 0..self.recording.bodies.len() {
             let ([x, y], [vx, vy]) = (frame.positions[i], frame.velocities[i]);
             for (k, recorded) in [x, y, vx, vy].into_iter().enumerate() {
                 let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
@@ -108,32 +119,38 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
     }
 }
 
+/// One step from every recorded state in f64 and in f32, and the free run: steps and worst position.
+type Errors = ([f64; 2], [f64; 2], (usize, f64));
+
 /// Measures everything in a [`MpeReport`].
 pub(super) fn verify(recording: &Recording) -> MpeReport {
-    let standard = Body { size: 0.1, mass: 1.0, movable: true, collide: true };
-    // Standard agents go through the very code of the rollouts, whose bodies are known to be alike.
-    let alike = recording.agents.iter().all(|&body| body == standard);
-    let double = physics::<f64>(recording);
-    let single = physics::<f32>(recording);
-    let (one_step, one_step_f32, free_run) = if alike {
-        let double_bodies = || Alike(Pair::equal(&double, 0.2));
-        (
-            one_step(World::new(recording, double, double_bodies()), false),
-            one_step(World::new(recording, single, Alike(Pair::equal(&single, 0.2))), true),
-            free_run(World::new(recording, double, double_bodies())),
+    let (double, single) = (physics::<f64>(recording), physics::<f32>(recording));
+    // Standard bodies go through the very code of the rollouts, which knows their kinds.
+    let body = |size| Body { size, mass: 1.0, movable: true, collide: true };
+    let (agents, balls) = recording.bodies.split_at(recording.agents);
+    let standard =
+        agents.iter().all(|&agent| agent == body(AGENT_RADIUS)) && balls.iter().all(|&ball| ball == body(BALL_RADIUS));
+    let errors = if !standard {
+        let bodies = &recording.bodies;
+        replay(
+            recording,
+            Mixed { bodies: bodies.clone(), physics: double },
+            Mixed { bodies: bodies.clone(), physics: single },
         )
+    } else if balls.is_empty() {
+        replay(recording, Alike(Pair::equal(&double, CONTACT_DISTANCE)), Alike(Pair::equal(&single, CONTACT_DISTANCE)))
     } else {
-        let mixed = || Mixed { bodies: recording.agents.clone(), physics: double };
-        let mixed_f32 = Mixed { bodies: recording.agents.clone(), physics: single };
-        (
-            one_step(World::new(recording, double, mixed()), false),
-            one_step(World::new(recording, single, mixed_f32), true),
-            free_run(World::new(recording, double, mixed())),
+        let n = recording.agents;
+        replay(
+            recording,
+            AgentsAndBalls::new(&double, n, AGENT_RADIUS, BALL_RADIUS),
+            AgentsAndBalls::new(&single, n, AGENT_RADIUS, BALL_RADIUS),
         )
     };
+    let (one_step, one_step_f32, free_run) = errors;
     let mut report = MpeReport {
         name: recording.name.clone(),
-        agents: recording.agents.len(),
+        agents: recording.agents,
         steps: recording.actions.len(),
         one_step_position: one_step[0],
         one_step_velocity: one_step[1],
@@ -154,6 +171,14 @@ pub(super) fn verify(recording: &Recording) -> MpeReport {
         report.overlap_mismatches += usize::from(overlaps(recording, frame) != frame.overlaps);
     }
     report
+}
+
+fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double: A, single: B) -> Errors {
+    (
+        one_step(World::new(recording, physics(recording), double.clone()), false),
+        one_step(World::new(recording, physics(recording), single), true),
+        free_run(World::new(recording, physics(recording), double)),
+    )
 }
 
 fn physics<R: Real>(recording: &Recording) -> Physics<R> {
@@ -212,32 +237,45 @@ fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
     (dx * dx + dy * dy).sqrt()
 }
 
-/// The reward the authors' code pays, with its two defects: the bonus compares the normalised distance with the
-/// radius, and an agent collides with itself.
+/// The reward the authors' code pays. In Simple Spread it has two defects: the bonus compares the normalised distance
+/// with the radius, and an agent collides with itself.
 fn authors_reward(recording: &Recording, frame: &Frame, i: usize) -> f64 {
-    let n = recording.agents.len();
-    let goal = frame.positions[n + recording.goals[i]];
-    let normalised = distance(frame.positions[i], goal) / recording.distance_unit;
-    let bonus = if normalised <= recording.agents[0].size + recording.landmarks[0].size { 1.0 } else { 0.0 };
-    let hit = |&a: &usize| {
-        distance(frame.positions[a], frame.positions[i]) < recording.agents[a].size + recording.agents[i].size
-    };
-    -normalised + bonus - (0..n).filter(hit).count() as f64
+    let (n, first_landmark) = (recording.agents, recording.bodies.len());
+    let (agents, landmark) = (&recording.bodies[..n], recording.landmarks[0]);
+    match &recording.scenario {
+        Scenario::Spread { goals, distance_unit } => {
+            let goal = frame.positions[first_landmark + goals[i]];
+            let normalised = distance(frame.positions[i], goal) / distance_unit;
+            let bonus = if normalised <= agents[0].size + landmark.size { 1.0 } else { 0.0 };
+            let hit = |&a: &usize| distance(frame.positions[a], frame.positions[i]) < agents[a].size + agents[i].size;
+            -normalised + bonus - (0..n).filter(hit).count() as f64
+        }
+        Scenario::PushBall { goals } => {
+            let [ball, goal] = [frame.positions[n + goals[i][0]], frame.positions[first_landmark + goals[i][1]]];
+            let (to_ball, to_goal) = (distance(frame.positions[i], ball), distance(ball, goal));
+            let bonus = if to_goal <= 2.0 * landmark.size { 1.0 } else { 0.0 };
+            -(to_ball + to_goal) + bonus
+        }
+    }
 }
 
-/// Share of the landmarks within reach of any agent.
+/// Share of the landmarks within reach of any agent, or in Push Ball of any ball.
 fn authors_success(recording: &Recording, frame: &Frame) -> f64 {
-    let (agents, landmarks) = frame.positions.split_at(recording.agents.len());
+    let (bodies, landmarks) = frame.positions.split_at(recording.bodies.len());
+    let first = match recording.scenario {
+        Scenario::Spread { .. } => 0,
+        Scenario::PushBall { .. } => recording.agents,
+    };
     let covered = |(landmark, body): &(&[f64; 2], &Body)| {
-        let reach = recording.agents[0].size + body.size;
-        agents.iter().any(|&agent| distance(agent, **landmark) <= reach)
+        let reach = recording.bodies[first].size + body.size;
+        bodies[first..].iter().any(|&position| distance(position, **landmark) <= reach)
     };
     landmarks.iter().zip(&recording.landmarks).filter(covered).count() as f64 / landmarks.len() as f64
 }
 
 /// Pairs of colliding bodies that overlap.
 fn overlaps(recording: &Recording, frame: &Frame) -> usize {
-    let bodies = || recording.agents.iter().zip(&frame.positions).filter(|(body, _)| body.collide);
+    let bodies = || recording.bodies.iter().zip(&frame.positions).filter(|(body, _)| body.collide);
     let hits = |(k, (a, pa)): (usize, (&Body, &[f64; 2]))| {
         bodies().skip(k + 1).filter(|&(b, pb)| distance(*pa, *pb) < a.size + b.size).count()
     };

@@ -5,7 +5,7 @@ fn file(name: &str) -> String {
     std::fs::read_to_string(path).unwrap()
 }
 
-const NAMES: [&str; 8] = [
+const NAMES: [&str; 13] = [
     "spread_n1_integrator",
     "spread_n2_axis",
     "spread_n2_headon_y",
@@ -14,6 +14,11 @@ const NAMES: [&str; 8] = [
     "spread_n5_overlap",
     "spread_n20_goal",
     "spread_n50_dense",
+    "push_n1_scripted",
+    "push_n2_scripted",
+    "push_n5_crowd",
+    "push_n5_push",
+    "push_n20_random_start",
 ];
 
 #[test]
@@ -38,10 +43,13 @@ fn bodies_of_general_sizes_take_the_general_path_to_the_same_numbers() {
     // A second agent, far away and slightly larger, sends every pair through the code for mixed bodies.
     let recording = Recording::parse(&file("spread_n5_overlap")).unwrap();
     let mut mixed = recording.clone();
-    mixed.agents[0].mass = 1.0 + 1e-15;
+    mixed.bodies[0].mass = 1.0 + 1e-15;
     let (a, b) = (replay::verify(&recording), replay::verify(&mixed));
     assert!(a.agrees() && b.agrees(), "{b:?}");
     assert!((a.one_step_position - b.one_step_position).abs() < 1e-14);
+    let mut pushed = Recording::parse(&file("push_n5_crowd")).unwrap();
+    pushed.bodies[9].mass = 1.0 + 1e-15;
+    assert!(replay::verify(&pushed).agrees());
 }
 
 #[test]
@@ -65,7 +73,7 @@ fn a_heavy_agent_is_pushed_less_and_a_fixed_one_not_at_all() {
     // One step of two overlapping agents by hand: F1 = (m2/m1) f, F2 = (m1/m2) f, a = F / m.
     let recording = Recording::parse(&file("spread_n2_overlap")).unwrap();
     let mut heavy = recording.clone();
-    heavy.agents[1].mass = 2.0;
+    heavy.bodies[1].mass = 2.0;
     heavy.actions.truncate(1);
     heavy.actions[0] = vec![0, 0];
     heavy.frames.truncate(2);
@@ -90,7 +98,7 @@ fn a_heavy_agent_is_pushed_less_and_a_fixed_one_not_at_all() {
     assert!(report.one_step_velocity < 1e-12 && report.one_step_position < 1e-12, "{report:?}");
 
     let mut fixed = heavy;
-    fixed.agents[1].movable = false;
+    fixed.bodies[1].movable = false;
     expect(&mut fixed, 1.0, 0.0);
     let velocity = before.velocities[1];
     fixed.frames[1].velocities[1] = velocity;
@@ -111,12 +119,17 @@ fn a_disturbed_recording_is_noticed() {
     assert!(verify_mpe(&text).unwrap().disagreements()[0].contains("reward"));
     let text = edited("spread_n5_goal", |value| value["overlaps"][3] = 99.into());
     assert_eq!(verify_mpe(&text).unwrap().overlap_mismatches, 1);
+    let text = edited("push_n5_push", |value| value["ball_of_agent"][0] = 1.into());
+    assert!(verify_mpe(&text).unwrap().disagreements()[0].contains("reward"));
+    let text = edited("push_n5_push", |value| value["success_rate"][50] = 0.9.into());
+    assert!(verify_mpe(&text).unwrap().disagreements()[0].contains("success"));
 }
 
 #[test]
 fn other_scenarios_and_formats_are_refused_by_name() {
-    let error = verify_mpe(&file("push_n1_scripted")).unwrap_err();
-    assert!(matches!(&error, GoldenError::UnsupportedScenario { found } if found == "push_ball"), "{error}");
+    let text = edited("spread_n1_integrator", |value| value["scenario"] = "tag".into());
+    let error = verify_mpe(&text).unwrap_err();
+    assert!(matches!(&error, GoldenError::UnsupportedScenario { found } if found == "tag"), "{error}");
     let text = edited("spread_n1_integrator", |value| value["format"] = "mpe-golden-2".into());
     assert!(matches!(verify_mpe(&text), Err(GoldenError::Format { .. })));
     assert!(matches!(verify_mpe("{"), Err(GoldenError::Json(_))));
@@ -125,14 +138,16 @@ fn other_scenarios_and_formats_are_refused_by_name() {
 
 #[test]
 fn every_missing_or_malformed_field_is_named() {
-    let whole: serde_json::Value = serde_json::from_str(&file("spread_n2_axis")).unwrap();
-    for field in whole.as_object().unwrap().keys().filter(|field| *field != "note") {
-        let text = edited("spread_n2_axis", |value| {
-            value.as_object_mut().unwrap().remove(field);
-        });
-        assert!(verify_mpe(&text).unwrap_err().to_string().starts_with(field.as_str()), "{field}");
-        let text = edited("spread_n2_axis", |value| value[field] = serde_json::json!({"x": 1}));
-        assert!(verify_mpe(&text).unwrap_err().to_string().starts_with(field.as_str()), "{field}");
+    for name in ["spread_n2_axis", "push_n2_scripted"] {
+        let whole: serde_json::Value = serde_json::from_str(&file(name)).unwrap();
+        for field in whole.as_object().unwrap().keys().filter(|field| *field != "note") {
+            let text = edited(name, |value| {
+                value.as_object_mut().unwrap().remove(field);
+            });
+            assert!(verify_mpe(&text).unwrap_err().to_string().starts_with(field.as_str()), "{name} {field}");
+            let text = edited(name, |value| value[field] = serde_json::json!({"x": 1}));
+            assert!(verify_mpe(&text).unwrap_err().to_string().starts_with(field.as_str()), "{name} {field}");
+        }
     }
     for field in ["dt", "damping", "contact_force", "contact_margin", "action_sensitivity", "action_uxuy"] {
         let text = edited("spread_n2_axis", |value| {
@@ -152,6 +167,16 @@ fn every_missing_or_malformed_field_is_named() {
     ];
     for (field, edit) in broken {
         let error = verify_mpe(&edited("spread_n2_axis", edit)).unwrap_err().to_string();
+        assert!(error.starts_with(field), "{field}: {error}");
+    }
+    let broken: [(&str, Edit); 4] = [
+        ("ball_of_agent[1]", |value| value["ball_of_agent"][1] = 2.into()),
+        ("land_of_agent[0]", |value| value["land_of_agent"][0] = 2.into()),
+        ("n_balls", |value| value["n_balls"] = 0.into()),
+        ("entities[2].kind", |value| value["entities"][2]["kind"] = "landmark".into()),
+    ];
+    for (field, edit) in broken {
+        let error = verify_mpe(&edited("push_n2_scripted", edit)).unwrap_err().to_string();
         assert!(error.starts_with(field), "{field}: {error}");
     }
 }

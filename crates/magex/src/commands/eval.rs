@@ -8,7 +8,7 @@ use crate::folder;
 use crate::output::{Table, note, seconds, share};
 use crate::settings;
 use magex_core::ids::Mode;
-use magex_core::task::Spawn;
+use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::metrics::{EvalSummary, summarise};
 use magex_runtime::exit;
@@ -128,15 +128,17 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
     }
 
     let mut means = Map::new();
-    let mut table = Table::new(3, &HEADING);
+    let columns = columns(&config.task);
+    let heading: Vec<&str> = ["spawn", "seed", "mode"].into_iter().chain(columns.iter().map(|column| column.0)).collect();
+    let mut table = Table::new(3, &heading);
     for row in &rows {
-        table.row(cells(row.spawn.to_string(), row.seed.to_string(), row.mode, &row.summary));
+        table.row(cells(&columns, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary));
     }
     for &mode in modes.list() {
         let of_mode = all.iter().filter(|(m, _)| *m == mode).flat_map(|(_, metrics)| metrics);
         let Some(summary) = summarise(of_mode) else { continue };
         if rows.len() > modes.list().len() {
-            table.row(cells("all".into(), String::new(), mode, &summary));
+            table.row(cells(&columns, ["all".into(), String::new()], mode, &summary));
         }
         means.insert(mode_name(mode).into(), serde_json::to_value(&summary)?);
     }
@@ -145,6 +147,7 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
     output.result(&json!({
         "run": args.run,
         "weights_sha256": trained.sha256,
+        "task": config.task.name,
         "agents": config.task.agents,
         "horizon": config.task.horizon,
         "executor": config.executor.kind,
@@ -167,35 +170,33 @@ fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
     }
 }
 
-const HEADING: [&str; 11] = [
-    "spawn",
-    "seed",
-    "mode",
-    "episodes",
-    "success",
-    "matched",
-    "all covered",
-    "arrival",
-    "collisions",
-    "cost",
-    "reward",
-];
+/// A number of the table: its heading, and how it is written.
+type Column = (&'static str, fn(&EvalSummary) -> String);
 
-fn cells(spawn: String, seed: String, mode: Mode, summary: &EvalSummary) -> Vec<String> {
-    let s = summary;
-    vec![
-        spawn,
-        seed,
-        mode_name(mode).into(),
-        s.episodes.to_string(),
-        share(s.success_rate),
-        share(s.matched_success_rate),
-        share(s.all_covered_rate),
-        format!("{:.1}", s.arrival_step),
-        format!("{:.4}", s.collisions_per_agent_step),
-        format!("{:.4}", s.cost_ratio),
-        format!("{:.3}", s.reward),
-    ]
+/// What says something about a task.
+fn columns(task: &TaskConfig) -> Vec<Column> {
+    let mut columns: Vec<Column> = vec![
+        ("episodes", |s| s.episodes.to_string()),
+        ("success", |s| share(s.success_rate)),
+        ("matched", |s| share(s.matched_success_rate)),
+        ("all covered", |s| share(s.all_covered_rate)),
+        ("at spawn", |s| share(s.spawn_success_rate)),
+        ("arrival", |s| format!("{:.1}", s.arrival_step)),
+        ("collisions", |s| format!("{:.4}", s.collisions_per_agent_step)),
+    ];
+    if task.name == TaskName::Drones {
+        columns.push(("crashed", |s| format!("{:.4}", s.collision_rate)));
+    }
+    columns.push(("cost", |s| format!("{:.4}", s.cost_ratio)));
+    if task.stages().len() > 1 {
+        columns.push(("second cost", |s| s.second_cost_ratio.map_or_else(String::new, |x| format!("{x:.4}"))));
+    }
+    columns.push(("reward", |s| format!("{:.3}", s.reward)));
+    columns
+}
+
+fn cells(columns: &[Column], [spawn, seed]: [String; 2], mode: Mode, summary: &EvalSummary) -> Vec<String> {
+    [spawn, seed, mode_name(mode).into()].into_iter().chain(columns.iter().map(|column| column.1(summary))).collect()
 }
 
 fn value(row: &Row) -> serde_json::Result<Value> {

@@ -12,6 +12,7 @@ use crate::supervise::{self, Crew};
 use anyhow::Context as _;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
+use magex_core::task::TaskName;
 use magex_learner::trainer::{Outcome, TrainError, Trainer};
 use magex_runtime::{backoff, exit, shutdown};
 use serde::Deserialize;
@@ -223,7 +224,9 @@ struct Summary {
     all_covered_rate: f64,
     arrival_step: f64,
     collisions_per_agent_step: f64,
+    collision_rate: f64,
     cost_ratio: f64,
+    second_cost_ratio: Option<f64>,
     joint_env_steps: u64,
     iterations: u32,
     final_episodes: u32,
@@ -252,7 +255,14 @@ fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow
         ("all covered", share(s.all_covered_rate)),
         ("arrival step", format!("{:.1} of {horizon}", s.arrival_step)),
         ("collisions", format!("{:.4} per agent and step", s.collisions_per_agent_step)),
-        ("assignment cost", format!("{:.4} of the exact one", s.cost_ratio)),
+        ("collision rate", format!("{:.4} of the agents crashed", s.collision_rate)),
+        (
+            "assignment cost",
+            match s.second_cost_ratio {
+                None => format!("{:.4} of the exact one", s.cost_ratio),
+                Some(second) => format!("{:.4} and {second:.4} of the exact ones", s.cost_ratio),
+            },
+        ),
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
         (
             "wall time",
@@ -262,7 +272,8 @@ fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow
     ];
     let out = job.folder.display();
     output.say(format!("\nDone: {why}. On {episodes} episodes with starts that training never saw:\n"));
-    for (name, value) in rows {
+    let crashes = job.config.task.name == TaskName::Drones;
+    for (name, value) in rows.into_iter().filter(|(name, _)| crashes || *name != "collision rate") {
         output.say(format!("  {name:<16} {value}"));
     }
     let magex = program();

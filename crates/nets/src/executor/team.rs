@@ -3,10 +3,11 @@
 use super::{Input, Layer, Network, Output, RELU_GAIN, constant};
 use crate::features::FeatureSpec;
 use crate::matmul::Activation;
-use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others};
+use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others, neighbour_pool};
 use crate::params::{ParamError, Source, Start};
 use candle_core::{D, DType, Device, Result as CandleResult, Tensor};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
+use std::sync::Arc;
 
 /// Heads and width of a head of the attention ablation (authors' code: 4 × 16).
 const HEADS: usize = 4;
@@ -54,6 +55,8 @@ pub struct TeamNet {
     observe: Layer,
     team: Team,
     goal: Layer,
+    /// Encounter Encoder: Σ over neighbours of relu(neighbour → F / 2), where the task has encounters.
+    encounters: Option<(Tensor, Tensor)>,
     fuse_norm: Option<Norm>,
     state: Layer,
     gates: Layer,
@@ -128,12 +131,24 @@ impl TeamNet {
                 Team::Graph { encode, blocks, literal }
             }
         };
+        let (near, half) = (spec.neighbours > 0, f / 2);
+        let fused = 2 * f + if near { half } else { 0 };
+        let encounters = if near {
+            let width = spec.neighbour_width();
+            Some((
+                source.get("f_near.weight", &[width, half], Start::Orthogonal(RELU_GAIN))?,
+                source.get("f_near.bias", &[half], Start::Constant(0.0))?,
+            ))
+        } else {
+            None
+        };
         Ok(Self {
             observe,
             team,
+            encounters,
             goal: Layer::build(source, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?,
-            fuse_norm: if config.feature_norm { Some(Norm::build(source, "f_state.norm", 2 * f)?) } else { None },
-            state: Layer::build(source, "f_state", (2 * f, f), relu, RELU_GAIN)?,
+            fuse_norm: if config.feature_norm { Some(Norm::build(source, "f_state.norm", fused)?) } else { None },
+            state: Layer::build(source, "f_state", (fused, f), relu, RELU_GAIN)?,
             gates: Layer::build(source, "gru.input", (f, 3 * f), Activation::Identity, 1.0)?,
             recurrent: (
                 source.get("gru.weight", &[f, 3 * f], Start::Orthogonal(1.0))?,
@@ -205,7 +220,15 @@ impl Network for TeamNet {
         let sequences = input.sequences * input.agents;
         let team = self.team_features(input)?;
         let goal = self.goal.forward_constant(&constant(&input.features.goals, self.spec.goal_width())?)?;
-        let mut fused = Tensor::cat(&[&goal, &team], 1)?;
+        let mut fused = match &self.encounters {
+            None => Tensor::cat(&[&goal, &team], 1)?,
+            Some((w, b)) => {
+                let f = input.features;
+                let shape = (f.counts.len(), self.spec.neighbours, self.spec.neighbour_width());
+                let near = Tensor::from_slice(&f.neighbours, shape, &Device::Cpu)?;
+                Tensor::cat(&[&goal, &team, &neighbour_pool(&near, Arc::new(f.counts.clone()), w, b)?], 1)?
+            }
+        };
         if let Some(norm) = &self.fuse_norm {
             fused = norm.forward(&fused)?;
         }

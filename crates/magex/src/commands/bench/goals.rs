@@ -201,7 +201,7 @@ pub(super) fn ranking(args: &RankingArgs) -> anyhow::Result<Report> {
             entropy: args.entropy,
             ..CommanderConfig::default()
         };
-        let ppo = CommanderPpo::new(&config, args.agents, 2, args.seed);
+        let ppo = CommanderPpo::new(&config, &task, args.seed);
         let build = |state: &CommanderState| {
             Commander::build(&config, args.agents, 2, &mut state.params.source(state.params.plain()?))
         };

@@ -1,0 +1,109 @@
+//! Where the agents, balls and landmarks of an episode start.
+
+use super::layouts::{layout, scale};
+use super::{PUSH_DISTANCE, SPACING};
+use crate::layouts::{Curve, LAYOUTS, Points};
+use crate::spawn::{lattice, near, scatter};
+use crate::spread::CONTACT_DISTANCE;
+use magex_core::rng::Stream;
+use magex_core::task::{Spawn, TaskConfig};
+
+/// Part of the way to a neighbour by which points on the lines are moved.
+const JITTER: f64 = 0.3;
+/// Tries after which a slot stays where it is, or an agent out of line.
+const PATIENCE: usize = 100;
+
+/// The start of an episode. Balls start 0.3 from each other, agents 0.2 from each other and 0.25 from balls.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Start {
+    /// `[N, 2]`
+    pub agents: Vec<f32>,
+    /// `[N, 2]`
+    pub balls: Vec<f32>,
+    /// `[N, 2]`
+    pub landmarks: Vec<f32>,
+}
+
+/// Draws the start of an episode from its own stream. What `training` may add is drawn last, so that the same stream
+/// gives an evaluation episode the same start whatever `task.push_ball.aligned` is.
+pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Start {
+    let mut start = match task.spawn {
+        Spawn::Uniform => uniform(task.agents, task.side, stream),
+        Spawn::Lines(fixed) => on_layout(task, fixed, JITTER, stream),
+        Spawn::Authors(fixed) => on_layout(task, fixed, 0.0, stream),
+    };
+    if training && stream.uniform() < f64::from(task.push_ball.aligned) {
+        align(&mut start, stream);
+    }
+    start
+}
+
+/// Everything uniform in the centred square. A task that validates has room; if luck runs out all the same, agents and
+/// balls share a lattice.
+fn uniform(n: usize, side: f32, stream: &mut Stream) -> Start {
+    let balls = scatter(n, side, SPACING, None, stream);
+    let both = balls.and_then(|balls| {
+        let agents = scatter(n, side, CONTACT_DISTANCE, Some((&balls, PUSH_DISTANCE)), stream)?;
+        Some((agents, balls))
+    });
+    let (agents, balls) = both.unwrap_or_else(|| {
+        let mut agents = lattice(2 * n, side, SPACING, stream);
+        let balls = agents.split_off(2 * n);
+        (agents, balls)
+    });
+    let landmarks = scatter(n, side, SPACING, None, stream).unwrap_or_else(|| lattice(n, side, SPACING, stream));
+    Start { agents, balls, landmarks }
+}
+
+/// Balls on their curves and everybody else on the slots, in random order, each moved along its curve by up to `jitter` of
+/// the way to a neighbour. A slot that a ball reaches into goes to a landmark.
+fn on_layout(task: &TaskConfig, fixed: Option<u8>, jitter: f64, stream: &mut Stream) -> Start {
+    let layout = layout(fixed.unwrap_or_else(|| stream.below(u32::from(LAYOUTS)) as u8), task.agents);
+    let scale = scale(task);
+    let places = |points: &Points| -> Vec<(Curve, usize, usize)> {
+        points.iter().flat_map(|&(curve, n)| (0..n).map(move |k| (curve.scaled(scale), k, n))).collect()
+    };
+    let moved = |&(curve, k, n): &(Curve, usize, usize), stream: &mut Stream| {
+        curve.jittered((k, n), jitter, SPACING, stream).map(|c| c as f32)
+    };
+
+    let mut balls: Vec<[f32; 2]> = places(&layout.balls).iter().map(|place| moved(place, stream)).collect();
+    stream.shuffle(&mut balls);
+    let balls = balls.concat();
+    let blocked = |&[x, y]: &[f32; 2]| near(&balls, x, y, PUSH_DISTANCE);
+    let free = |place: &(Curve, usize, usize)| {
+        let mut point = moved(place, stream);
+        for _ in 0..PATIENCE {
+            if !blocked(&point) {
+                break;
+            }
+            point = moved(place, stream);
+        }
+        point
+    };
+    let mut slots: Vec<[f32; 2]> = places(&layout.slots).iter().map(free).collect();
+    stream.shuffle(&mut slots);
+    slots.sort_by_key(blocked);
+    let mut agents = slots.concat();
+    let landmarks = agents.split_off(2 * task.agents);
+    Start { agents, balls, landmarks }
+}
+
+/// Puts agents in line with balls: each takes the x or the y of a random ball, exactly, wherever that leaves the spacings.
+fn align(start: &mut Start, stream: &mut Stream) {
+    let n = start.agents.len() / 2;
+    for i in 0..n {
+        for _ in 0..PATIENCE {
+            let (ball, axis) = (stream.below(n as u32) as usize, stream.below(2) as usize);
+            let mut point = [start.agents[2 * i], start.agents[2 * i + 1]];
+            point[axis] = start.balls[2 * ball + axis];
+            let [x, y] = point;
+            let (before, after) = (&start.agents[..2 * i], &start.agents[2 * i + 2..]);
+            let close = near(before, x, y, CONTACT_DISTANCE) || near(after, x, y, CONTACT_DISTANCE);
+            if !close && !near(&start.balls, x, y, PUSH_DISTANCE) {
+                start.agents[2 * i..2 * i + 2].copy_from_slice(&point);
+                break;
+            }
+        }
+    }
+}
