@@ -194,8 +194,10 @@ fn random_actions(n: usize) -> impl Strategy<Value = Vec<Vec<u8>>> {
     prop::collection::vec(prop::collection::vec(0..3u8, 3 * n), 1..40)
 }
 
+type Points = Vec<[f32; 3]>;
+
 /// Positions in a small box (many meetings), velocities up to 2 m/s, and actions.
-fn cases() -> impl Strategy<Value = (Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<Vec<u8>>)> {
+fn cases() -> impl Strategy<Value = (Points, Points, Vec<Vec<u8>>)> {
     (1..5usize).prop_flat_map(|n| {
         let position = [-0.4..0.4f32, -0.4..0.4f32, 0.1..0.5f32];
         let velocity = [-1.2..1.2f32, -1.2..1.2f32, -1.2..1.2f32];
