@@ -4,6 +4,7 @@
 //! that claims a supported format and cannot be read is a failure, and so is a folder without any supported recording.
 
 use magex_assign::golden as assignment;
+use magex_env::golden::drones::{self, DroneReport, verify_drones};
 use magex_env::golden::{GoldenError, MpeReport, verify_mpe};
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -24,8 +25,10 @@ pub struct Check {
     pub what: &'static str,
     /// The worst difference.
     pub worst: f64,
-    /// The largest one that passes.
+    /// The largest one that passes; infinite if the number is for information.
     pub limit: f64,
+    /// What there is to know about a number for information; may be empty.
+    pub words: String,
 }
 
 /// How a file fared.
@@ -161,12 +164,16 @@ fn verify_text(text: &str, report: &mut FileReport) {
             Ok(measured) => assignment_problems(&measured, report),
             Err(error) => report.outcome = fails(error),
         },
+        format if drones::FORMATS.contains(&format) => match verify_drones(text) {
+            Ok(measured) => drone_flight(measured, report),
+            Err(error) => report.outcome = fails(error),
+        },
         other => report.outcome = Outcome::Skipped(format!("format {other} is not supported by this version")),
     }
 }
 
 fn mpe(measured: &MpeReport, report: &mut FileReport) {
-    let check = |what, worst, limit| Check { what, worst, limit };
+    let check = |what, worst, limit| Check { what, worst, limit, words: String::new() };
     let one_step = measured.one_step_position.max(measured.one_step_velocity);
     report.content =
         format!("N = {}, {} steps, {} of them free", measured.agents, measured.steps, measured.free_run_steps);
@@ -184,10 +191,30 @@ fn mpe(measured: &MpeReport, report: &mut FileReport) {
 
 fn assignment_problems(measured: &assignment::Report, report: &mut FileReport) {
     report.content = format!("{} problems, {} with one optimum", measured.problems, measured.matchings);
-    report.checks = vec![Check { what: "relative cost", worst: measured.worst, limit: assignment::TOLERANCE }];
+    report.checks = vec![Check {
+        what: "relative cost",
+        worst: measured.worst,
+        limit: assignment::TOLERANCE,
+        words: String::new(),
+    }];
     if !measured.passed() {
         let words = measured.mismatches.iter().map(|mismatch| format!("{}: {}", mismatch.name, mismatch.reason));
         report.outcome = Outcome::Fails(words.collect());
+    }
+}
+
+fn drone_flight(measured: DroneReport, report: &mut FileReport) {
+    let disagreements = measured.disagreements();
+    report.content = measured.content;
+    let checks = measured.measures.into_iter().map(|measure| Check {
+        what: measure.what,
+        worst: measure.worst,
+        limit: measure.limit.unwrap_or(f64::INFINITY),
+        words: measure.words,
+    });
+    report.checks = checks.collect();
+    if !disagreements.is_empty() {
+        report.outcome = Outcome::Fails(disagreements);
     }
 }
 
@@ -209,7 +236,11 @@ impl fmt::Display for VerifyReport {
                 write!(f, "  {}", file.content)?;
             }
             for check in &file.checks {
-                write!(f, "  {} {:.1e} (≤ {:.0e})", check.what, check.worst, check.limit)?;
+                if check.limit.is_finite() {
+                    write!(f, "  {} {:.1e} (≤ {:.0e})", check.what, check.worst, check.limit)?;
+                } else {
+                    write!(f, "  {} {:.1e} (for information: {})", check.what, check.worst, check.words)?;
+                }
             }
             match &file.outcome {
                 Outcome::Agrees => writeln!(f)?,
@@ -229,7 +260,8 @@ impl fmt::Display for VerifyReport {
         let (agreeing, failing, skipped) = (self.agreeing(), self.failing(), self.skipped());
         write!(f, "{agreeing} agree, {failing} fail, {skipped} skipped")?;
         if agreeing + failing == 0 {
-            write!(f, "; FAIL: no recording of a supported format (mpe-golden-1, {})", assignment::FORMAT)?;
+            let drones = drones::FORMATS.join(", ");
+            write!(f, "; FAIL: no recording of a supported format (mpe-golden-1, {}, {drones})", assignment::FORMAT)?;
         }
         Ok(())
     }
@@ -269,8 +301,10 @@ mod tests {
             let Outcome::Fails(reasons) = verify(&text).outcome else { panic!("{text} passes") };
             assert!(reasons[0].contains(reason), "{reasons:?}");
         }
-        let Outcome::Skipped(reason) = verify(r#"{"format":"drone-golden-1"}"#).outcome else { panic!("not skipped") };
-        assert_eq!(reason, "format drone-golden-1 is not supported by this version");
+        let Outcome::Skipped(reason) = verify(r#"{"format":"drone-golden-2"}"#).outcome else { panic!("not skipped") };
+        assert_eq!(reason, "format drone-golden-2 is not supported by this version");
+        let Outcome::Fails(reasons) = verify(r#"{"format":"drone-golden-1"}"#).outcome else { panic!("passes") };
+        assert!(reasons[0].starts_with("physics"), "{reasons:?}");
     }
 
     #[test]

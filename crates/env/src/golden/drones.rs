@@ -11,10 +11,9 @@ mod exact;
 mod forces;
 mod recording;
 
-pub use recording::{Mode, Physics, Trajectory};
-
 use super::GoldenError;
 use super::reader::Field;
+use recording::Trajectory;
 
 /// One measured difference.
 #[derive(Debug, Clone, PartialEq)]

@@ -14,7 +14,7 @@ const UNIT: f64 = 1e-3;
 
 /// What moved the drones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Physics {
+pub(super) enum Physics {
     /// Bullet's integration with these effects.
     Bullet(Effects),
     /// The explicit model.
@@ -23,7 +23,7 @@ pub enum Physics {
 
 /// What commanded the motors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Mode {
+pub(super) enum Mode {
     /// The recording's own rpm.
     Rpm,
     /// Tracking of a velocity.
@@ -34,54 +34,54 @@ pub enum Mode {
 
 /// What the controller computed on the way, per control period and drone.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Trace {
+pub(super) struct Trace {
     /// Velocity: direction and fraction of the speed limit; position: x, y, z, yaw.
-    pub command: Vec<[f64; 4]>,
+    pub(super) command: Vec<[f64; 4]>,
     /// Collective PWM.
-    pub thrust_pwm: Vec<f64>,
+    pub(super) thrust_pwm: Vec<f64>,
     /// Intrinsic X-Y-Z angles of the target attitude.
-    pub target_euler: Vec<[f64; 3]>,
+    pub(super) target_euler: Vec<[f64; 3]>,
 }
 
 /// A recorded flight.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Trajectory {
+pub(super) struct Trajectory {
     /// Constants of the drone.
-    pub craft: Craft,
+    pub(super) craft: Craft,
     /// Gains of the controller.
-    pub gains: Gains,
+    pub(super) gains: Gains,
     /// The name of the physics, as the file says it.
-    pub physics_name: String,
+    pub(super) physics_name: String,
     /// The physics.
-    pub physics: Physics,
+    pub(super) physics: Physics,
     /// The mode.
-    pub mode: Mode,
+    pub(super) mode: Mode,
     /// Physics steps per second.
-    pub physics_hz: f64,
+    pub(super) physics_hz: f64,
     /// Control periods per second.
-    pub control_hz: f64,
+    pub(super) control_hz: f64,
     /// Seconds per physics step.
-    pub dt: f64,
+    pub(super) dt: f64,
     /// Seconds per control period.
-    pub control_dt: f64,
+    pub(super) control_dt: f64,
     /// Physics steps per control period.
-    pub hold: usize,
+    pub(super) hold: usize,
     /// N.
-    pub drones: usize,
+    pub(super) drones: usize,
     /// m/s of a full command in velocity mode, else 0.
-    pub speed_limit: f64,
+    pub(super) speed_limit: f64,
     /// `[T + 1][N]` frame t is the state before step t.
-    pub frames: Vec<Vec<State>>,
+    pub(super) frames: Vec<Vec<State>>,
     /// `[T + 1][N]` body rates of the explicit model, else empty.
-    pub rates: Vec<Vec<[f64; 3]>>,
+    pub(super) rates: Vec<Vec<[f64; 3]>>,
     /// `[T][N]`
-    pub rpm: Vec<Vec<[f64; 4]>>,
+    pub(super) rpm: Vec<Vec<[f64; 4]>>,
     /// `[K]`, closed loop only.
-    pub control: Vec<Trace>,
+    pub(super) control: Vec<Trace>,
     /// Whether a perturbation grows too fast for free runs to be compared to the end.
-    pub chaotic: bool,
+    pub(super) chaotic: bool,
     /// Steps of the free run.
-    pub horizon: usize,
+    pub(super) horizon: usize,
 }
 
 /// An array of known length.
@@ -229,7 +229,7 @@ impl Trajectory {
     }
 
     /// T.
-    pub fn steps(&self) -> usize {
+    pub(super) fn steps(&self) -> usize {
         self.rpm.len()
     }
 

@@ -155,8 +155,7 @@ fn every_missing_or_malformed_field_is_named() {
 /// Replaces something somewhere.
 fn mutate(value: &mut Value, mut path: &[u16], new: Value) {
     let mut here = value;
-    loop {
-        let Some((&step, rest)) = path.split_first() else { break };
+    while let Some((&step, rest)) = path.split_first() {
         let len = match &*here {
             Value::Array(list) => list.len(),
             Value::Object(object) => object.len(),
