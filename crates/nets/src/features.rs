@@ -198,10 +198,9 @@ impl FeatureSpec {
     fn symmetry(&self, state: &State<'_>, i: usize) -> Symmetry {
         match self.observation.frame {
             Frame::World => Symmetry::default(),
-            Frame::Octant => {
-                let last = self.targets - 1;
-                let from = if last == 0 { state.position(i) } else { state.target(i, last - 1) };
-                Symmetry::to_first_octant(offset(from, state.target(i, last)).0)
+            Frame::Push => {
+                let (ball, landmark) = (state.target(i, 0), state.target(i, self.targets - 1));
+                Symmetry::facing(offset(ball, landmark).0, offset(state.position(i), ball).0)
             }
         }
     }

@@ -6,9 +6,10 @@ pub enum Frame {
     /// The axes of the world.
     #[default]
     World,
-    /// The axes of the world, mirrored and swapped so that the last leg of the agent's way (ball → landmark) points into
-    /// the first octant. The policy need not learn eight copies of one skill; its actions are turned back.
-    Octant,
+    /// The axes of the world, mirrored and swapped so that the way of the agent's ball to its landmark points along the
+    /// first one, and the agent is always on the same side of that way. The policy need not learn eight copies of one skill,
+    /// and is never of two minds about which way to walk around a ball; its actions are turned back.
+    Push,
 }
 
 /// Sizes that a task's features are measured with. Lengths are world units.

@@ -19,8 +19,8 @@ pub struct PushBallConfig {
     pub bonus: f32,
     /// Charged per unit of distance left, on every step.
     pub distance: f32,
-    /// Share of the training episodes in which agents start in line with balls: starts that random positions never
-    /// show, and fixed layouts do.
+    /// Share of the training episodes in which agents start exactly in line with their balls, on the landmarks' side: starts
+    /// that random positions never show, and fixed layouts do.
     pub aligned: f32,
 }
 
@@ -34,7 +34,7 @@ impl Default for PushBallConfig {
 const SPACING: f32 = 0.3;
 
 pub(super) fn observation() -> Observation {
-    Observation { reach: 1.5, reached: 0.3, frame: Frame::Octant, ..Observation::default() }
+    Observation { reach: 1.5, reached: 0.3, frame: Frame::Push, ..Observation::default() }
 }
 
 pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {

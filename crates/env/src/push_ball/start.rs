@@ -12,6 +12,10 @@ use magex_core::task::{Spawn, TaskConfig};
 const JITTER: f64 = 0.3;
 /// Tries after which a slot stays where it is, or an agent out of line.
 const PATIENCE: usize = 100;
+/// Nearest that an agent, or a landmark, is put in line with a ball; the farthest is half the side of the map.
+const IN_LINE: f64 = 0.35;
+/// Most that a landmark is off the line, per unit of distance.
+const ASIDE: f64 = 0.6;
 
 /// The start of an episode. Balls start 0.3 from each other, agents 0.2 from each other and 0.25 from balls.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,7 +37,7 @@ pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Start {
         Spawn::Authors(fixed) => on_layout(task, fixed, 0.0, stream),
     };
     if training && stream.uniform() < f64::from(task.push_ball.aligned) {
-        align(&mut start, stream);
+        align(&mut start, task.side, stream);
     }
     start
 }
@@ -89,19 +93,36 @@ fn on_layout(task: &TaskConfig, fixed: Option<u8>, jitter: f64, stream: &mut Str
     Start { agents, balls, landmarks }
 }
 
-/// Puts agents in line with balls: each takes the x or the y of a random ball, exactly, wherever that leaves the spacings.
-fn align(start: &mut Start, stream: &mut Stream) {
-    let n = start.agents.len() / 2;
-    for i in 0..n {
+/// Puts an agent exactly in line with each ball, and a landmark behind the agent, exactly or nearly in the same direction,
+/// wherever the map and the spacings leave room: the start from which a policy without a preferred side pushes its ball
+/// straight away from the landmark for ever. Random positions never show it, fixed layouts do.
+fn align(start: &mut Start, side: f32, stream: &mut Stream) {
+    let Start { agents, balls, landmarks } = start;
+    for (i, ball) in balls.chunks_exact(2).enumerate() {
         for _ in 0..PATIENCE {
-            let (ball, axis) = (stream.below(n as u32) as usize, stream.below(2) as usize);
-            let mut point = [start.agents[2 * i], start.agents[2 * i + 1]];
-            point[axis] = start.balls[2 * ball + axis];
-            let [x, y] = point;
-            let (before, after) = (&start.agents[..2 * i], &start.agents[2 * i + 2..]);
-            let close = near(before, x, y, CONTACT_DISTANCE) || near(after, x, y, CONTACT_DISTANCE);
-            if !close && !near(&start.balls, x, y, PUSH_DISTANCE) {
-                start.agents[2 * i..2 * i + 2].copy_from_slice(&point);
+            let (axis, sign) = (stream.below(2) as usize, if stream.below(2) == 0 { 1.0 } else { -1.0 });
+            let along = |distance: f64, aside: f64| {
+                let mut point = [ball[0], ball[1]];
+                point[axis] += sign * distance as f32;
+                point[1 - axis] += (distance * aside) as f32;
+                point
+            };
+            let far = f64::from(side) / 2.0;
+            let agent = along(stream.range(IN_LINE, far), 0.0);
+            let aside = if stream.below(4) == 0 { 0.0 } else { stream.range(-ASIDE, ASIDE) };
+            let landmark = along(stream.range(IN_LINE, far), aside);
+            let inside = |point: [f32; 2]| point.iter().all(|c| c.abs() <= side / 2.0);
+            let apart = |points: &[f32], [x, y]: [f32; 2], spacing: f64| {
+                !near(&points[..2 * i], x, y, spacing) && !near(&points[2 * i + 2..], x, y, spacing)
+            };
+            if inside(agent)
+                && inside(landmark)
+                && apart(agents, agent, CONTACT_DISTANCE)
+                && apart(landmarks, landmark, SPACING)
+                && !near(balls, agent[0], agent[1], PUSH_DISTANCE)
+            {
+                agents[2 * i..2 * i + 2].copy_from_slice(&agent);
+                landmarks[2 * i..2 * i + 2].copy_from_slice(&landmark);
                 break;
             }
         }

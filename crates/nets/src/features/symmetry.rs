@@ -10,10 +10,19 @@ pub struct Symmetry {
 }
 
 impl Symmetry {
-    /// The one that turns a direction into the first octant: 0 ≤ y ≤ x.
-    pub(crate) fn to_first_octant(direction: [f32; 3]) -> Self {
-        let [x, y, _] = direction;
-        Self { mirror: [x < 0.0, y < 0.0], swap: y.abs() > x.abs() }
+    /// The one that turns the ball's way to its landmark along the first axis, |y| ≤ x, with the agent's way to the ball
+    /// turning left into it: (to_ball × way) ≥ 0.
+    pub(crate) fn facing(way: [f32; 3], to_ball: [f32; 3]) -> Self {
+        let [x, y, _] = way;
+        let swap = y.abs() > x.abs();
+        let along = usize::from(swap);
+        let mut mirror = [false; 2];
+        mirror[along] = way[along] < 0.0;
+        let cross = to_ball[0].mul_add(y, -(to_ball[1] * x));
+        // Every mirror and every swap turns left into right.
+        let left = if swap ^ mirror[along] { -cross } else { cross };
+        mirror[1 - along] = left < 0.0;
+        Self { mirror, swap }
     }
 
     /// A vector of the world as the agent sees it. The third axis stays.
@@ -67,10 +76,14 @@ mod tests {
     }
 
     #[test]
-    fn every_direction_is_seen_in_the_first_octant() {
-        for (x, y) in [(1.0, 0.2), (-1.0, 0.2), (0.2, -1.0), (-0.2, -1.0), (0.0, 0.0), (1.0, -1.0)] {
-            let [a, b, _] = Symmetry::to_first_octant([x, y, 0.0]).see([x, y, 0.0]);
-            assert!(0.0 <= b && b <= a, "{x} {y}: {a} {b}");
+    fn every_way_is_seen_along_the_first_axis_from_the_same_side() {
+        let directions = [(1.0, 0.2), (-1.0, 0.2), (0.2, -1.0), (-0.2, -1.0), (0.0, 0.0), (1.0, -1.0), (0.3, 0.7)];
+        for (x, y) in directions {
+            for (u, v) in directions {
+                let symmetry = Symmetry::facing([x, y, 0.0], [u, v, 0.0]);
+                let ([a, b, _], [c, d, _]) = (symmetry.see([x, y, 0.0]), symmetry.see([u, v, 0.0]));
+                assert!(b.abs() <= a && c * b - d * a >= 0.0, "{x} {y}, {u} {v}");
+            }
         }
     }
 

@@ -148,14 +148,18 @@ fn jittered_points_use_their_room() {
     assert!((sum - 0.5 * most).abs() < 0.02 * most, "{sum}");
 }
 
-/// Agents that have the very x or y of some ball.
+/// Agents exactly in line with their ball, whose landmark is on the same side.
 fn in_line(start: &Start) -> usize {
-    let shares = |agent: &[f32]| start.balls.chunks_exact(2).any(|ball| ball[0] == agent[0] || ball[1] == agent[1]);
-    start.agents.chunks_exact(2).filter(|agent| shares(agent)).count()
+    let between = |axis: usize, agent: &[f32], ball: &[f32], landmark: &[f32]| {
+        ball[1 - axis] == agent[1 - axis] && (agent[axis] > ball[axis]) == (landmark[axis] > ball[axis])
+    };
+    let points = |all: &[f32]| -> Vec<[f32; 2]> { all.chunks_exact(2).map(|c| [c[0], c[1]]).collect() };
+    let triples = points(&start.agents).into_iter().zip(points(&start.balls)).zip(points(&start.landmarks));
+    triples.filter(|((a, b), l)| between(0, a, b, l) || between(1, a, b, l)).count()
 }
 
 #[test]
-fn training_lines_up_agents_with_balls_as_often_as_asked() {
+fn training_puts_agents_in_the_way_of_their_balls_as_often_as_asked() {
     for mode in [Spawn::Uniform, Spawn::Lines(None)] {
         for aligned in [0.0, 0.3, 1.0] {
             let mut task = task(if mode == Spawn::Uniform { 5 } else { 20 }, mode);
@@ -164,7 +168,7 @@ fn training_lines_up_agents_with_balls_as_often_as_asked() {
             for k in 0..1000 {
                 let plain = spawn(&task, false, &mut stream(k));
                 let start = spawn(&task, true, &mut stream(k));
-                assert_eq!((&plain.balls, &plain.landmarks), (&start.balls, &start.landmarks));
+                assert_eq!(plain.balls, start.balls);
                 check_spacings(&start, task.agents, "in line");
                 let changed = plain != start;
                 episodes += usize::from(changed);
@@ -172,7 +176,7 @@ fn training_lines_up_agents_with_balls_as_often_as_asked() {
             }
             let share = episodes as f32 / 1000.0;
             assert!((share - aligned).abs() < 0.05, "{mode} {aligned}: {share}");
-            assert!(agents as f32 >= 0.95 * (episodes * task.agents) as f32, "{mode}: {agents} of {episodes}");
+            assert!(agents as f32 >= 0.9 * (episodes * task.agents) as f32, "{mode}: {agents} of {episodes}");
         }
     }
 }
