@@ -50,8 +50,8 @@ impl Default for DroneConfig {
             downwash: Downwash::Limited,
             progress: 2.0,
             bonus: 0.1,
-            crash: 10.0,
-            proximity: 1.0,
+            crash: 20.0,
+            proximity: 2.0,
             proximity_radius: 0.4,
             tilt: 1.0,
         }
