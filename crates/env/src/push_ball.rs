@@ -228,3 +228,6 @@ impl Env for PushBall {
         (0..self.episodes()).map(|world| self.score(world)).collect()
     }
 }
+
+#[cfg(test)]
+mod tests;

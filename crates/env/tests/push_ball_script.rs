@@ -71,3 +71,79 @@ fn measure() {
         );
     }
 }
+
+fn check(agents: usize, spawn: Spawn, episodes: u32, at_least: f32) {
+    let task = TaskConfig::of(TaskName::PushBall, agents, spawn);
+    let (scores, _) = play(&task, episodes);
+    let success = mean(&scores, |score| score.success);
+    assert!(success >= at_least, "{agents} {spawn}: success {success}");
+    // What counts is nearly always the ball that was meant.
+    assert!(mean(&scores, |score| score.matched_success) >= at_least - 0.02, "{agents} {spawn}");
+}
+
+#[test]
+fn uniform_starts_are_solved() {
+    check(5, Spawn::Uniform, 40, 0.98);
+    check(20, Spawn::Uniform, 10, 0.98);
+}
+
+#[test]
+fn the_layouts_are_solved() {
+    for layout in 0..4 {
+        check(20, Spawn::Lines(Some(layout)), 5, 0.96);
+        check(20, Spawn::Authors(Some(layout)), 5, 0.96);
+    }
+}
+
+#[test]
+fn the_choice_depends_on_the_state_alone() {
+    // Three states of two episodes in one call, or one by one: the same actions.
+    let task = TaskConfig::of(TaskName::PushBall, 5, Spawn::Uniform);
+    let streams = (0..2).map(|episode| Key::new(9, Purpose::EvalSpawn, &[2, episode]).stream());
+    let mut env = PushBall::new(&task, streams, false).unwrap();
+    let goals: Vec<u32> = (0..2).flat_map(|_| (0..5).flat_map(|i| [i, 4 - i])).collect();
+    env.set_goals(&goals).unwrap();
+    let landmarks = env.landmarks().to_vec();
+    let (mut positions, mut velocities, mut one_by_one) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..3 {
+        let (p, v) = (env.positions(), env.velocities());
+        let mut actions = vec![0; 10];
+        for b in 0..2 {
+            let view = View {
+                positions: &p[20 * b..20 * b + 20],
+                velocities: &v[20 * b..20 * b + 20],
+                extras: &[],
+                landmarks: &landmarks[10 * b..10 * b + 10],
+                goals: &goals[10 * b..10 * b + 10],
+            };
+            scripted_push_ball(&view, 5, &mut actions[5 * b..5 * b + 5]).unwrap();
+        }
+        env.step(&actions, &mut [0.0; 10]).unwrap();
+        positions.extend(p);
+        velocities.extend(v);
+        one_by_one.extend(actions);
+    }
+    let mut together = vec![9; 30];
+    let view =
+        View { positions: &positions, velocities: &velocities, extras: &[], landmarks: &landmarks, goals: &goals };
+    scripted_push_ball(&view, 5, &mut together).unwrap();
+    assert_eq!(together, one_by_one);
+
+    let mut wrong = goals.clone();
+    wrong[3] = 5;
+    let error = scripted_push_ball(&View { goals: &wrong, ..view }, 5, &mut together).unwrap_err().to_string();
+    assert!(error.contains("goals[3]") && error.contains("landmark"), "{error}");
+    for (view, field) in [
+        (View { positions: &positions[1..], ..view }, "positions"),
+        (View { velocities: &velocities[1..], ..view }, "velocities"),
+        (View { landmarks: &landmarks[1..], ..view }, "landmarks"),
+        (View { goals: &goals[1..], ..view }, "goals"),
+        (View { extras: &[0.0], ..view }, "extras"),
+    ] {
+        let error = scripted_push_ball(&view, 5, &mut together).unwrap_err().to_string();
+        assert!(error.starts_with(field), "{error}");
+    }
+    let view = View { positions: &positions[..40], velocities: &velocities[..40], ..view };
+    assert!(scripted_push_ball(&view, 5, &mut together[..15]).unwrap_err().to_string().starts_with("actions"));
+    assert!(scripted_push_ball(&view, 5, &mut together[..10]).is_ok());
+}

@@ -17,7 +17,8 @@ pub enum Downwash {
 }
 
 /// `[task.drones]`: physics and reward of the drone task.
-/// r = progress · (d − d') + bonus · 1\[d' ≤ 0.15\] − crash · 1\[crashed now\] − proximity · max(0, 1 − d_min / proximity_radius).
+/// r = progress · (d − d') + bonus · 1\[d' ≤ 0.15\] − crash · 1\[crashed now\] − proximity · max(0, 1 − d_min / proximity_radius)
+/// − tilt · max(0, 1 − cos(tilt angle) / cos 45°).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DroneConfig {
@@ -37,6 +38,8 @@ pub struct DroneConfig {
     pub proximity: f32,
     /// Distance from which proximity costs nothing, metres.
     pub proximity_radius: f32,
+    /// Charged per step for a tilt of 90°, less with the angle, nothing up to 45°: a drone that is asked for too much tumbles.
+    pub tilt: f32,
 }
 
 impl Default for DroneConfig {
@@ -50,6 +53,7 @@ impl Default for DroneConfig {
             crash: 10.0,
             proximity: 1.0,
             proximity_radius: 0.4,
+            tilt: 1.0,
         }
     }
 }
@@ -79,7 +83,13 @@ pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
     let d = &task.drones;
     coefficients(
         "task.drones",
-        &[("progress", d.progress), ("bonus", d.bonus), ("crash", d.crash), ("proximity", d.proximity)],
+        &[
+            ("progress", d.progress),
+            ("bonus", d.bonus),
+            ("crash", d.crash),
+            ("proximity", d.proximity),
+            ("tilt", d.tilt),
+        ],
     )?;
     if task.spawn != Spawn::Uniform {
         return Err(format!("task.spawn: drones start uniform in the box, not on '{}'; use uniform", task.spawn));

@@ -119,6 +119,8 @@ impl Episode {
             sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };
             sum -= if crashed { f64::from(config.crash) } else { 0.0 };
             sum -= f64::from(config.proximity) * closeness;
+            let upright = f64::from(self.world.drones[i].upright());
+            sum -= f64::from(config.tilt) * (1.0 - upright * std::f64::consts::SQRT_2).max(0.0);
             *reward = sum as f32;
             self.reward += sum;
         }

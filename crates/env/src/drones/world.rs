@@ -92,7 +92,7 @@ impl Drone {
     }
 
     /// R_zz: the cosine of the tilt.
-    fn upright(&self) -> f32 {
+    pub(crate) fn upright(&self) -> f32 {
         let r = self.motion.pose.rotation;
         1.0 - 2.0 * (r.x * r.x + r.y * r.y)
     }

@@ -107,3 +107,6 @@ fn align(start: &mut Start, stream: &mut Stream) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
