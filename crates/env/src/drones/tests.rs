@@ -279,6 +279,48 @@ fn a_head_on_collision_keeps_momentum_and_is_seen_in_its_step() {
 }
 
 #[test]
+fn drones_that_pass_through_each_other_within_a_step_have_met() {
+    let laws = vacuum(1.0 / 120.0);
+    // 58.3 mm per step: 4 mm apart before it, 4 mm apart after it.
+    let start = [state([0.0, 0.0, 1.0292], [0.0, 0.0, -5.0]), state([0.03, 0.0, 1.0], [0.0, 0.0, 2.0])];
+    let mut world = World::new(start.iter().map(Drone::at).collect());
+    world.judge();
+    assert_eq!(world.drones[0].crash, None);
+    world.step(&laws, &[[0.0; 4]; 2]);
+    world.judge();
+    assert_eq!((world.drones[0].crash, world.drones[1].crash), (Some(Crash::Contact), Some(Crash::Contact)));
+}
+
+#[test]
+fn rapier_does_not_put_a_hovering_drone_to_sleep() {
+    // Beyond rapier's half a second of rest.
+    let start = [[0.2, -0.3, 1.5], [0.2, 0.5, 1.5]];
+    let mut task = task(2);
+    task.drones.downwash = Downwash::Off;
+    let (mut lazy, mut always) = (episode(&task, &start, &[[0.0; 3]; 2]), episode(&task, &start, &[[0.0; 3]; 2]));
+    always.laws.always = true;
+    for _ in 0..90 {
+        assert_eq!(step(&mut lazy, &[1; 6]).bits(), step(&mut always, &[1; 6]).bits());
+    }
+    assert_eq!(step(&mut lazy, &[0; 6]).bits(), step(&mut always, &[0; 6]).bits());
+}
+
+#[test]
+fn washes_add_up_in_an_order_that_does_not_depend_on_names() {
+    let above = [[0.1, 0.0, 2.6], [-0.1, 0.11, 3.1], [0.0, -0.17, 3.7]];
+    let fall = |order: [usize; 3]| {
+        let positions: Vec<[f32; 3]> = std::iter::once([0.0, 0.0, 0.5]).chain(order.map(|k| above[k])).collect();
+        let mut drones = episode(&task(4), &positions, &[[0.0; 3]; 4]);
+        step(&mut drones, &[1; 12]).velocities[..3].to_vec()
+    };
+    let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+    assert!(fall(orders[0])[2] < -1e-3);
+    for order in orders {
+        assert_eq!(fall(order), fall(orders[0]), "{order:?}");
+    }
+}
+
+#[test]
 fn a_drone_that_falls_crashes_on_the_ground_and_stays_there() {
     let mut drones = episode(&task(2), &[[0.0, 0.0, 0.3], [1.0, 0.0, 1.5]], &[[0.0, 0.0, -1.9], [0.0; 3]]);
     let mut down = [1; 6];
@@ -340,8 +382,11 @@ fn a_tilt_beyond_the_horizon_is_a_crash_in_its_step() {
 
 #[test]
 fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
-    let positions = [[0.0, 0.0, 1.5], [0.5, 0.0, 1.7], [0.0, 0.6, 1.3]];
-    let mut drones = episode(&task(3), &positions, &[[0.0; 3]; 3]);
+    // The second one is within rapier's reach of the first.
+    let positions = [[0.0, 0.0, 1.5], [0.126, 0.0, 1.5], [0.0, 0.6, 1.3]];
+    let mut task = task(3);
+    task.drones.downwash = Downwash::Off;
+    let mut drones = episode(&task, &positions, &[[0.0; 3]; 3]);
     step(&mut drones, &[1; 9]);
     let before = drones.episodes[0].world.drones[0].motion.pose;
     drones.episodes[0].spoil(0);

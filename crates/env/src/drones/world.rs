@@ -282,8 +282,8 @@ impl World {
         }
     }
 
-    /// Pairs that overlap after the step or half-way through it. Two drones close at no more than 4 m/s, 17 mm in half a
-    /// step of 120 Hz: not enough to pass through the 25 mm of a drone unseen.
+    /// Pairs that overlap after the step or half-way through it. Drones one above the other overlap over 50 mm of way: two
+    /// in flight close at up to 4 m/s, 33 mm per step of 120 Hz, but one may be falling; so seen, up to 12 m/s.
     fn mark_overlaps(&mut self) {
         for i in 1..self.drones.len() {
             for j in 0..i {
