@@ -119,8 +119,7 @@ impl Episode {
             sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };
             sum -= if crashed { f64::from(config.crash) } else { 0.0 };
             sum -= f64::from(config.proximity) * closeness;
-            let upright = f64::from(self.world.drones[i].upright());
-            sum -= f64::from(config.tilt) * (1.0 - upright * std::f64::consts::SQRT_2).max(0.0);
+            sum -= f64::from(config.tilt) * steepness(f64::from(self.world.drones[i].upright()));
             *reward = sum as f32;
             self.reward += sum;
         }
@@ -186,6 +185,11 @@ impl Episode {
 fn limited(velocity: V3) -> V3 {
     let speed = norm(velocity);
     if speed > MOST_SPEED { scale(velocity, MOST_SPEED / speed) } else { velocity }
+}
+
+/// How far a tilt, given its cosine, is beyond 45°: 0 up to there, 1 at 90°.
+pub(super) fn steepness(cosine: f64) -> f64 {
+    (1.0 - cosine * std::f64::consts::SQRT_2).max(0.0)
 }
 
 fn covered(near: &[Vec<u32>]) -> usize {

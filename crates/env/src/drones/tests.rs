@@ -401,9 +401,17 @@ fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
 }
 
 #[test]
+fn only_steep_tilts_cost() {
+    let degrees = |angle: f64| libm::cos(angle.to_radians());
+    assert_eq!((episode::steepness(1.0), episode::steepness(degrees(44.9))), (0.0, 0.0));
+    assert!((episode::steepness(degrees(60.0)) - (1.0 - 0.5f64.sqrt())).abs() < 1e-12);
+    assert!((episode::steepness(degrees(90.0)) - 1.0).abs() < 1e-12);
+}
+
+#[test]
 fn the_reward_is_the_documented_sum() {
     let mut task = task(2);
-    task.drones.downwash = Downwash::Off;
+    (task.drones.downwash, task.drones.proximity, task.drones.proximity_radius) = (Downwash::Off, 1.0, 0.4);
     let positions = [[0.0, 0.0, 1.5], [0.3, 0.0, 1.5]];
     let landmarks = [0.0, 0.1, 1.5, 2.0, 0.0, 1.5];
     let mut drones = Drones::from_state(&task, positions.as_flattened(), &[0.0; 6], &landmarks).unwrap();
