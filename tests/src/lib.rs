@@ -7,6 +7,7 @@ pub mod sandbox;
 use magex::local::LocalCollector;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
+use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_learner::collector::RunEvent;
 use magex_learner::trainer::{Outcome, Trainer};
 use std::path::Path;
@@ -24,6 +25,14 @@ pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
         iterations * 8 * 20
     );
     RunConfig::from_toml(&text).unwrap_or_else(|e| panic!("the test's configuration: {e}"))
+}
+
+/// [`small`] for another task.
+pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
+    let mut config = small(kind, agents, iterations);
+    config.task = TaskConfig { horizon: config.task.horizon, ..TaskConfig::of(name, agents, Spawn::Uniform) };
+    config.commander.random_share = 0.5;
+    config.resolved().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
 }
 
 /// How a run in this process ended, and the SHA-256 of what it learned.

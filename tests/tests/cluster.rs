@@ -2,9 +2,9 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_core::config::{ExecutorKind, RunConfig};
-use magex_core::task::Spawn;
+use magex_core::task::{Spawn, TaskName};
 use magex_tests::sandbox::{Cluster, wait_until};
-use magex_tests::{small, train};
+use magex_tests::{small, small_task, train};
 
 fn undisturbed(config: &RunConfig) -> String {
     train(config, tempfile::tempdir().unwrap().path(), 1, 1).sha256
@@ -31,6 +31,19 @@ fn one_actor_two_actors_and_one_process_learn_the_same_bits() {
             for actor in &mut cluster.actors {
                 assert!(actor.wait().success(), "an actor ends well when the run is done:\n{}", actor.log());
             }
+        }
+    }
+}
+
+#[test]
+fn every_task_learns_the_same_bits_with_one_actor_two_actors_and_in_one_process() {
+    for name in [TaskName::PushBall, TaskName::Drones] {
+        let config = small_task(name, ExecutorKind::Magex, 4, 3);
+        let expected = undisturbed(&config);
+        for actors in [1, 2] {
+            let mut cluster = Cluster::start(&config);
+            (0..actors).for_each(|_| cluster.start_actor());
+            assert_eq!(cluster.finish(), expected, "{name} with {actors} actors");
         }
     }
 }

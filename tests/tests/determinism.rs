@@ -3,9 +3,10 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::task::TaskName;
 use magex_learner::checkpoint;
 use magex_learner::trainer::{Outcome, Trainer};
-use magex_tests::{drive, small, train, updates};
+use magex_tests::{drive, small, small_task, train, updates};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -24,6 +25,37 @@ fn neither_actors_nor_training_threads_reach_a_number() {
         assert_eq!(one, hash(&config, 3, 1), "{kind}: three rollout threads");
         assert_eq!(one, hash(&config, 2, 2), "{kind}: two training threads");
     }
+}
+
+const TASKS: [TaskName; 2] = [TaskName::PushBall, TaskName::Drones];
+
+#[test]
+fn every_task_gives_the_same_bits_and_ratios_of_one() {
+    for (name, kind) in TASKS.into_iter().flat_map(|name| [(name, ExecutorKind::Magex), (name, ExecutorKind::Local)]) {
+        let config = small_task(name, kind, 4, 3);
+        let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
+        assert_eq!(ran.sha256, hash(&config, 3, 2), "{name} {kind}: three rollout and two training threads");
+        for line in updates(&ran.events).iter().filter(|l| !l["executor"].is_null()) {
+            for part in ["executor", "commander"] {
+                let error = line[part]["first_ratio_error"].as_f64().unwrap();
+                assert!(error <= 1e-6, "{name} {kind}: iteration {}, {part}: {error}", line["iteration"]);
+            }
+            assert_eq!(line["second_cost_ratio"].is_null(), line["success_rate"].is_null() || name == TaskName::Drones);
+        }
+    }
+}
+
+#[test]
+fn random_goals_reach_the_share_of_the_training_episodes_and_no_evaluation() {
+    let config = small_task(TaskName::Drones, ExecutorKind::Local, 4, 2);
+    let mut assigned = config.clone();
+    assigned.commander.random_share = 0.0;
+    assert_ne!(hash(&config, 1, 1), hash(&assigned, 1, 1));
+    let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
+    let Outcome::Finished(summary) = &ran.outcome else { panic!("not finished") };
+    assert!(summary.cost_ratio < 1.2, "evaluations are not given random goals: {}", summary.cost_ratio);
+    let trained: Vec<f64> = updates(&ran.events).iter().filter_map(|l| l["sampled_cost_ratio"].as_f64()).collect();
+    assert!(trained.iter().any(|&ratio| ratio > 1.1), "half of the training episodes are: {trained:?}");
 }
 
 #[test]

@@ -129,7 +129,8 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
 
     let mut means = Map::new();
     let columns = columns(&config.task);
-    let heading: Vec<&str> = ["spawn", "seed", "mode"].into_iter().chain(columns.iter().map(|column| column.0)).collect();
+    let heading: Vec<&str> =
+        ["spawn", "seed", "mode"].into_iter().chain(columns.iter().map(|column| column.0)).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
         table.row(cells(&columns, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary));
