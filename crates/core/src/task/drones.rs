@@ -51,8 +51,8 @@ impl Default for DroneConfig {
             progress: 2.0,
             bonus: 0.1,
             crash: 20.0,
-            proximity: 2.0,
-            proximity_radius: 0.4,
+            proximity: 3.0,
+            proximity_radius: 0.3,
             tilt: 1.0,
         }
     }

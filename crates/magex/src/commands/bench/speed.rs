@@ -5,8 +5,8 @@ use crate::output::thousands;
 use crate::settings;
 use magex_assign::bench::time_exact;
 use magex_core::config::{ExecutorKind, RunConfig};
-use magex_core::task::{Spawn, TaskConfig};
-use magex_env::bench::throughput;
+use magex_core::task::{Spawn, TaskConfig, TaskName};
+use magex_env::bench::{drone_throughput, throughput, throughput_of};
 use magex_learner::bench::minibatch;
 use serde_json::json;
 
@@ -29,12 +29,25 @@ impl Default for EnvArgs {
 
 pub(super) fn env(args: &EnvArgs) -> anyhow::Result<Report> {
     let title = "Environment alone, one core: contacts, collisions, rewards, spawns and metrics included";
-    let mut report = Report::new("env", title, 0, &["N", "worlds", "joint steps/s", "agent steps/s"]);
-    for (agents, worlds) in [(5, 64), (20, 32), (50, 32), (200, 16), (1000, 16)] {
-        let speed = throughput(agents, worlds, args.seconds)?;
-        let cells = [agents as f64, worlds as f64, speed, speed * agents as f64].map(thousands).to_vec();
-        report.row(cells, json!({ "agents": agents, "worlds": worlds, "joint_steps_per_s": speed }));
+    let mut report = Report::new("env", title, 1, &["task", "N", "worlds", "joint steps/s", "agent steps/s"]);
+    let sizes: [(TaskName, &[(usize, usize)]); 3] = [
+        (TaskName::SimpleSpread, &[(5, 64), (20, 32), (50, 32), (200, 16), (1000, 16)]),
+        (TaskName::PushBall, &[(5, 64), (20, 32), (50, 32)]),
+        (TaskName::Drones, &[(2, 64), (4, 64), (8, 32)]),
+    ];
+    for (name, agents, worlds) in sizes.iter().flat_map(|(name, sizes)| sizes.iter().map(|s| (*name, s.0, s.1))) {
+        let speed = match name {
+            TaskName::SimpleSpread => throughput(agents, worlds, args.seconds)?,
+            TaskName::PushBall => throughput_of(&TaskConfig::of(name, agents, Spawn::Uniform), worlds, args.seconds)?,
+            TaskName::Drones => drone_throughput(agents, worlds, true, args.seconds)?,
+        };
+        let numbers = [agents as f64, worlds as f64, speed, speed * agents as f64].map(thousands);
+        let cells = [name.to_string()].into_iter().chain(numbers).collect();
+        report.row(cells, json!({ "task": name, "agents": agents, "worlds": worlds, "joint_steps_per_s": speed }));
     }
+    report.notes.push(
+        "drones: a joint step is a command, 4 physics steps with their controllers, flown by the scripted pilot".into(),
+    );
     Ok(report)
 }
 
