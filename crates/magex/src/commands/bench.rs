@@ -3,6 +3,7 @@
 mod goals;
 mod runs;
 mod speed;
+mod tasks;
 mod training;
 
 use crate::cli::Global;
@@ -16,6 +17,7 @@ Examples:
   magex bench update --json
   magex bench commander --run runs/mine
   magex bench train --agents 50 --seeds 1,2,3       trains and evaluates; the result table
+  magex bench tasks --tasks drones-4                the same for Push Ball and the drones
   magex bench distributed                           services against one process
 
 Timings are medians on one core (unless a table says otherwise) and as noisy as the machine is busy:
@@ -48,9 +50,11 @@ enum What {
     Distributed(runs::DistributedArgs),
     /// Train and evaluate every size, executor and seed.
     Train(training::TrainArgs),
+    /// Train and evaluate Push Ball and the drones.
+    Tasks(tasks::TasksArgs),
     /// Weights of one team size on other team sizes.
     Generalisation(runs::GeneralisationArgs),
-    /// Env, update, assign, commander, ranking, distributed and train.
+    /// Env, update, assign, commander, ranking, distributed, train and tasks.
     All,
 }
 
@@ -95,6 +99,7 @@ pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
                 What::Ranking(Default::default()),
                 What::Distributed(Default::default()),
                 What::Train(Default::default()),
+                What::Tasks(Default::default()),
             ];
             quick().into_iter().chain(long).collect()
         }
@@ -121,6 +126,7 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Ranking(args) => goals::ranking(args),
         What::Distributed(args) => runs::distributed(args),
         What::Train(args) => training::train(args),
+        What::Tasks(args) => tasks::tasks(args),
         What::Generalisation(args) => runs::generalisation(args),
         What::All => Err(anyhow::anyhow!("all is not a table")),
     }
