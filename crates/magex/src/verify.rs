@@ -237,7 +237,7 @@ impl fmt::Display for VerifyReport {
             }
             for check in &file.checks {
                 if check.limit.is_finite() {
-                    write!(f, "  {} {:.1e} (≤ {:.0e})", check.what, check.worst, check.limit)?;
+                    write!(f, "  {} {:.1e} (≤ {:e})", check.what, check.worst, check.limit)?;
                 } else {
                     write!(f, "  {} {:.1e} (for information: {})", check.what, check.worst, check.words)?;
                 }
