@@ -1,7 +1,7 @@
-//! The Simple Spread task (paper, section 5.1.1): physics, spawn, reward, metrics, the scripted controller used as a
-//! yardstick, and the check of all of it against recordings of the authors' simulator.
+//! The particle tasks Simple Spread and Push Ball (paper, section 5.1.1): physics, spawn, reward, metrics, the scripted
+//! controllers used as yardsticks, and the check of all of it against recordings of the authors' simulator.
 //!
-//! [`Spread`] is a batch of B independent episodes stepped together, one world per SIMD lane. An episode is a pure
+//! An [`Env`] is a batch of B independent episodes stepped together, one world per SIMD lane. An episode is a pure
 //! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and
 //! on any machine.
 //!
