@@ -1,6 +1,8 @@
 //! Rules of the repository that a compiler does not check.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+use magex_core::config::RunConfig;
+use magex_core::task::{Spawn, TaskConfig, TaskName};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -107,7 +109,13 @@ fn files_stay_readable_and_mains_stay_short() {
 
 #[test]
 fn every_configuration_key_and_dependency_is_documented() {
-    let config = magex_core::config::RunConfig::default().to_toml().unwrap();
+    let mut config = RunConfig::default().to_toml().unwrap();
+    for name in [TaskName::PushBall, TaskName::Drones] {
+        let task = TaskConfig::of(name, 4, Spawn::Uniform);
+        let other = RunConfig { task, ..RunConfig::default() }.to_toml().unwrap();
+        let own = other.split("\n\n").find(|section| section.starts_with("[task.")).unwrap();
+        config = format!("{config}\n{own}\n");
+    }
     let reference = std::fs::read_to_string(root().join("docs/configuration.md")).unwrap();
     let mut section = String::new();
     for line in config.lines() {

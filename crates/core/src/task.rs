@@ -149,8 +149,8 @@ impl Default for RewardConfig {
     }
 }
 
-/// A task, fully determined. Equal tasks have equal fingerprints.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// A task, fully determined. Equal tasks have equal fingerprints. Written down without the sections of other tasks.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskConfig {
     /// Which task.
@@ -177,6 +177,38 @@ pub struct TaskConfig {
     /// What only the drones have.
     #[serde(default)]
     pub drones: DroneConfig,
+}
+
+impl Serialize for TaskConfig {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        #[derive(Serialize)]
+        struct Written<'a> {
+            name: TaskName,
+            agents: usize,
+            side: f32,
+            horizon: u32,
+            spawn: Spawn,
+            layout_scale: f32,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            reward: Option<&'a RewardConfig>,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            push_ball: Option<&'a PushBallConfig>,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            drones: Option<&'a DroneConfig>,
+        }
+        Written {
+            name: self.name,
+            agents: self.agents,
+            side: self.side,
+            horizon: self.horizon,
+            spawn: self.spawn,
+            layout_scale: self.layout_scale,
+            reward: (self.name == TaskName::SimpleSpread).then_some(&self.reward),
+            push_ball: (self.name == TaskName::PushBall).then_some(&self.push_ball),
+            drones: (self.name == TaskName::Drones).then_some(&self.drones),
+        }
+        .serialize(serializer)
+    }
 }
 
 /// Changes whenever the physics, the spawn, the reward or the observation change their meaning: part of the fingerprint.
@@ -404,6 +436,44 @@ mod tests {
             task.validate().unwrap();
         }
         assert_eq!(TaskConfig::simple_spread(200, Spawn::Uniform).horizon, 220);
+    }
+
+    #[test]
+    fn every_task_has_the_sizes_of_the_paper_and_refuses_the_settings_of_others() {
+        let sizes = |name, agents| {
+            let task = TaskConfig::of(name, agents, Spawn::Uniform);
+            task.validate().unwrap();
+            (task.side, task.horizon)
+        };
+        assert_eq!([sizes(TaskName::PushBall, 5), sizes(TaskName::PushBall, 20)], [(4.0, 100), (12.0, 200)]);
+        assert_eq!([sizes(TaskName::Drones, 2), sizes(TaskName::Drones, 4)], [(3.0, 120), (3.0, 120)]);
+        for name in [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones] {
+            let task = TaskConfig::of(name, 4, Spawn::Uniform);
+            let back: TaskConfig = serde_json::from_str(&serde_json::to_string(&task).unwrap()).unwrap();
+            assert_eq!(back.resolved(), task);
+            assert_eq!(task.shape(3).targets, task.stages().len());
+            let mut other = task.clone();
+            (other.reward.bonus, other.push_ball.arc, other.drones.bonus) = (0.5, 0.5, 0.5);
+            let error = other.validate().unwrap_err();
+            assert!(error.contains("belongs to") && error.contains(&name.to_string()), "{error}");
+        }
+    }
+
+    #[test]
+    fn drones_that_do_not_fit_or_cannot_be_controlled_are_refused_with_the_remedy() {
+        let refused = |change: fn(&mut TaskConfig), words: &str| {
+            let mut task = TaskConfig::of(TaskName::Drones, 4, Spawn::Uniform);
+            change(&mut task);
+            let error = task.validate().unwrap_err();
+            assert!(error.contains(words), "{error}");
+        };
+        refused(|t| t.agents = 60, "use a side of at least");
+        refused(|t| t.side = 0.5, "use a side of at least");
+        refused(|t| t.drones.spacing = 0.1, "task.drones.spacing");
+        refused(|t| t.drones.physics_hz = 90, "attitude controller");
+        refused(|t| t.drones.physics_hz = 130, "multiple of 30");
+        refused(|t| t.spawn = Spawn::Lines(None), "use uniform");
+        refused(|t| t.drones.crash = -1.0, "task.drones.crash");
     }
 
     #[test]
