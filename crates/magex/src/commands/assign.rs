@@ -66,6 +66,8 @@ pub(crate) enum Kind {
     Greedy,
     /// A random matching.
     Random,
+    /// The smallest largest distance.
+    Makespan,
 }
 
 /// How goals are chosen.
@@ -156,10 +158,11 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         }
     };
     output.say(format!(
-        "\n  summed distance {:.4}, least possible {:.4}, gap {:.2} %\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        "\n  summed distance {:.4}, least possible {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
         response.cost,
-        response.exact_cost,
-        100.0 * response.gap,
+        response.exact_cost.map_or_else(|| "not computed".into(), |cost| format!("{cost:.4}")),
+        response.gap.map_or_else(|| "unknown".into(), |gap| format!("{:.2} %", 100.0 * gap)),
+        response.largest_cost,
         1e3 * response.seconds,
         1e3 * round_trip
     ));
@@ -179,6 +182,7 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         "cost": response.cost,
         "exact_cost": response.exact_cost,
         "gap": response.gap,
+        "largest_cost": response.largest_cost,
         "scheduler": answered,
         "version": response.version,
         "weights_sha256": response.sha256,
@@ -195,6 +199,7 @@ fn scheduler(kind: Kind) -> v1::SchedulerKind {
         Kind::Exact => v1::SchedulerKind::Exact,
         Kind::Greedy => v1::SchedulerKind::Greedy,
         Kind::Random => v1::SchedulerKind::Random,
+        Kind::Makespan => v1::SchedulerKind::ExactMakespan,
     }
 }
 
@@ -204,6 +209,7 @@ fn kind_name(kind: v1::SchedulerKind) -> &'static str {
         v1::SchedulerKind::Exact => "exact",
         v1::SchedulerKind::Greedy => "greedy",
         v1::SchedulerKind::Random => "random",
+        v1::SchedulerKind::ExactMakespan => "makespan",
         v1::SchedulerKind::Unspecified => "unknown",
     }
 }
