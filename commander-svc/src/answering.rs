@@ -27,7 +27,7 @@ const LEARNED_PATIENCE: Duration = Duration::from_millis(500);
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Pairs of a team that is answered at once by a classical scheduler: well under a millisecond.
-const SMALL: usize = 16_384;
+const SMALL: usize = 10_000;
 
 /// The same for the learned scheduler.
 const SMALL_LEARNED: usize = 4096;
@@ -179,6 +179,14 @@ impl Answering {
         problem.cells() <= SMALL_LEARNED && pace.saturating_mul(MARGIN) <= clock.learned()
     }
 
+    /// A processor for work that is not one team's.
+    pub(crate) async fn processor(&self) -> Result<OwnedSemaphorePermit, Status> {
+        match tokio::time::timeout(QUEUE_PATIENCE, self.processors.clone().acquire_owned()).await {
+            Ok(Ok(permit)) => Ok(permit),
+            _ => Err(busy()),
+        }
+    }
+
     /// A processor and memory for a large team.
     async fn places(&self, problem: &Problem, clock: &Clock) -> Result<Places, Status> {
         let units = problem.cells().div_ceil(UNIT).clamp(1, UNITS) as u32;
@@ -189,7 +197,7 @@ impl Answering {
         };
         match tokio::time::timeout(patience, both).await {
             Ok(Some(places)) => Ok(places),
-            _ => Err(status::resource_exhausted("all processors are busy", QUEUE_PATIENCE)),
+            _ => Err(busy()),
         }
     }
 
@@ -281,6 +289,10 @@ fn stand_in(kind: SchedulerKind) -> SchedulerKind {
 
 fn took_longer(patience: Duration) -> String {
     format!("the model took longer than {patience:.1?}")
+}
+
+fn busy() -> Status {
+    status::resource_exhausted("all processors are busy", QUEUE_PATIENCE)
 }
 
 fn too_late() -> Status {

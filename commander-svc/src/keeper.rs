@@ -59,8 +59,9 @@ impl Keeper {
         caller: Caller,
         request: v1::CreateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
-        let own = self.clone();
+        let (own, permit) = (self.clone(), self.answering.processor().await?);
         let mission = blocking(move || {
+            let _held = permit;
             own.missions.check_room(&caller.name).map_err(kept)?;
             let (now, each) = (now_ms(), own.missions.bounds().each);
             let drawn = format!("m-{:016x}", incarnation());
@@ -77,8 +78,9 @@ impl Keeper {
         caller: Caller,
         request: v1::UpdateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
-        let own = self.clone();
+        let (own, permit) = (self.clone(), self.answering.processor().await?);
         let mission = blocking(move || {
+            let _held = permit;
             let each = own.missions.bounds().each;
             let mut attempt = 0;
             loop {

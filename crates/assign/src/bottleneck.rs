@@ -18,79 +18,98 @@ pub struct Bottleneck {
     pub largest: f64,
 }
 
+/// The solver's memory. Reusing one allocates nothing but the answers.
+#[derive(Debug, Default)]
+pub struct BottleneckSolver {
+    solver: Solver,
+    matcher: Matcher,
+    /// The costs, sorted; later the costs up to the threshold.
+    values: Vec<f64>,
+}
+
 /// Solves the bottleneck problem for `cost`, row-major `[rows, cols]`.
 ///
 /// # Errors
 /// As [`Solver::solve`].
 pub fn bottleneck(cost: &[f64], rows: usize, cols: usize) -> Result<Bottleneck, AssignError> {
     check_costs(cost, rows, cols)?;
-    search(cost, rows, cols, &mut Solver::default(), &|| true)
+    BottleneckSolver::default().search(cost, rows, cols, &|| true)
 }
 
-/// The same where a cost of +∞ forbids a pair: as many pairs as possible, among those the smallest largest cost, and
-/// among those the smallest sum. Gives up as soon as `go_on` says no.
-///
-/// # Errors
-/// As [`Solver::solve_allowed`].
-pub fn bottleneck_allowed(
-    cost: &[f64],
-    rows: usize,
-    cols: usize,
-    solver: &mut Solver,
-    go_on: &dyn Fn() -> bool,
-) -> Result<Bottleneck, AssignError> {
-    check_allowed(cost, rows, cols)?;
-    search(cost, rows, cols, solver, go_on)
-}
+impl BottleneckSolver {
+    /// [`bottleneck`] where a cost of +∞ forbids a pair: as many pairs as possible, among those the smallest largest
+    /// cost, and among those the smallest sum. Gives up as soon as `go_on` says no.
+    ///
+    /// # Errors
+    /// As [`Solver::solve_allowed`].
+    pub fn solve_allowed(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Bottleneck, AssignError> {
+        check_allowed(cost, rows, cols)?;
+        self.search(cost, rows, cols, go_on)
+    }
 
-fn search(
-    cost: &[f64],
-    rows: usize,
-    cols: usize,
-    solver: &mut Solver,
-    go_on: &dyn Fn() -> bool,
-) -> Result<Bottleneck, AssignError> {
-    let mut values: Vec<f64> = cost.iter().copied().filter(|&value| value < f64::INFINITY).collect();
-    if values.is_empty() {
-        let assignment = Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 };
-        return Ok(Bottleneck { assignment, largest: f64::NEG_INFINITY });
-    }
-    values.sort_unstable_by_key(|&value| ascending(value));
-    values.dedup();
-    let mut matcher = Matcher::default();
-    let pairs = match values.len() == cost.len() || !cost.contains(&f64::INFINITY) {
-        true => rows.min(cols),
-        false => matcher.run(cost, rows, cols, values[values.len() - 1]),
-    };
-    let (mut low, mut high) = (0, values.len() - 1);
-    while low < high {
-        if !go_on() {
-            return Err(AssignError::Interrupted);
-        }
-        let middle = low + (high - low) / 2;
-        if matcher.run(cost, rows, cols, values[middle]) == pairs {
-            high = middle;
-        } else {
-            low = middle + 1;
+    /// Gives back the memory of a problem of more than `cells` pairs.
+    pub fn forget_beyond(&mut self, cells: usize) {
+        if self.values.capacity() > cells {
+            *self = Self::default();
         }
     }
-    let largest = values[low];
-    // Of a large problem this is as much memory as the costs.
-    drop(values);
-    let within: Vec<f64> = cost.iter().map(|&value| if value <= largest { value } else { f64::INFINITY }).collect();
-    let assignment = solver.solve_allowed(&within, rows, cols, go_on)?;
-    // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
-    if assignment.pairs().count() == pairs {
-        return Ok(Bottleneck { assignment, largest });
+
+    fn search(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Bottleneck, AssignError> {
+        let Self { solver, matcher, values } = self;
+        values.clear();
+        values.extend(cost.iter().copied().filter(|&value| value < f64::INFINITY));
+        if values.is_empty() {
+            let assignment = Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 };
+            return Ok(Bottleneck { assignment, largest: f64::NEG_INFINITY });
+        }
+        let none_forbidden = values.len() == cost.len();
+        values.sort_unstable_by_key(|&value| ascending(value));
+        values.dedup();
+        let pairs = match none_forbidden {
+            true => rows.min(cols),
+            false => matcher.run(cost, rows, cols, values[values.len() - 1]),
+        };
+        let (mut low, mut high) = (0, values.len() - 1);
+        while low < high {
+            if !go_on() {
+                return Err(AssignError::Interrupted);
+            }
+            let middle = low + (high - low) / 2;
+            if matcher.run(cost, rows, cols, values[middle]) == pairs {
+                high = middle;
+            } else {
+                low = middle + 1;
+            }
+        }
+        let largest = values[low];
+        values.clear();
+        values.extend(cost.iter().map(|&value| if value <= largest { value } else { f64::INFINITY }));
+        let assignment = solver.solve_allowed(values, rows, cols, go_on)?;
+        // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
+        if assignment.pairs().count() == pairs {
+            return Ok(Bottleneck { assignment, largest });
+        }
+        matcher.run(cost, rows, cols, largest);
+        let col_of_row = matcher.col_of_row.clone();
+        let sum = cost_of(cost, cols, &col_of_row);
+        Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
     }
-    matcher.run(cost, rows, cols, largest);
-    let col_of_row = matcher.col_of_row;
-    let sum = cost_of(cost, cols, &col_of_row);
-    Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
 }
 
 /// Hopcroft–Karp on the pairs with a cost up to a threshold.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub(crate) struct Matcher {
     edges: Vec<u32>,
     /// `[rows + 1]` where each row's edges start.
@@ -114,8 +133,10 @@ impl Matcher {
             self.edges.extend((0..cols as u32).filter(|&col| row[col as usize] <= threshold));
             self.start.push(self.edges.len());
         }
-        self.col_of_row = vec![UNASSIGNED; rows];
-        self.row_of_col = vec![NONE; cols];
+        self.col_of_row.clear();
+        self.col_of_row.resize(rows, UNASSIGNED);
+        self.row_of_col.clear();
+        self.row_of_col.resize(cols, NONE);
         let mut matched = 0;
         while self.layers(rows) {
             self.cursor.clear();

@@ -18,7 +18,7 @@ pub mod greedy;
 pub mod random;
 pub mod two_swap;
 
-pub use bottleneck::{bottleneck, bottleneck_allowed};
+pub use bottleneck::{BottleneckSolver, bottleneck};
 pub use exact::{Solver, exact, exact_points};
 pub use greedy::{greedy, greedy_allowed};
 

@@ -136,7 +136,7 @@ proptest! {
         let answer = Solver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
         prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
         prop_assert!(close(answer.cost, sum, &finite), "{} instead of {sum}", answer.cost);
-        let answer = bottleneck_allowed(cost, rows, cols, &mut Solver::default(), &|| true).unwrap();
+        let answer = BottleneckSolver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
         prop_assert!(allowed(&answer.assignment) && answer.assignment.pairs().count() == pairs);
         prop_assert_eq!(answer.largest, largest);
         prop_assert!(close(answer.assignment.cost, within, &finite), "{} not {within}", answer.assignment.cost);

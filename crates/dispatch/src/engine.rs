@@ -6,7 +6,7 @@
 use crate::problem::Problem;
 use crate::{DispatchError, UNASSIGNED};
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, Solver, bottleneck_allowed, cost_of, greedy_allowed};
+use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy_allowed};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::SchedulerKind;
 use std::cell::RefCell;
@@ -52,6 +52,7 @@ pub struct Hopeless {
 #[derive(Debug, Default)]
 pub struct Workspace {
     solver: Solver,
+    makespan: BottleneckSolver,
     costs: Vec<f64>,
     adjusted: Vec<f64>,
 }
@@ -101,6 +102,7 @@ pub fn not_for_learned(problem: &Problem) -> Option<&'static str> {
 impl Workspace {
     fn forget(&mut self) {
         self.solver.forget_beyond(KEPT_CELLS);
+        self.makespan.forget_beyond(KEPT_CELLS);
         for buffer in [&mut self.costs, &mut self.adjusted] {
             if buffer.capacity() > KEPT_CELLS {
                 *buffer = Vec::new();
@@ -117,7 +119,7 @@ impl Workspace {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         problem.costs_into(&mut self.costs)?;
         let sticky = self.adjust(problem);
-        let Self { solver, costs, adjusted } = self;
+        let Self { solver, makespan, costs, adjusted } = self;
         let target: &[f64] = if sticky { adjusted } else { costs };
         let mut exact_cost = None;
         let goal_of = match kind {
@@ -128,7 +130,7 @@ impl Workspace {
                 answer.col_of_row
             }
             SchedulerKind::Makespan => {
-                bottleneck_allowed(target, rows, cols, solver, go_on).map_err(refused)?.assignment.col_of_row
+                makespan.solve_allowed(target, rows, cols, go_on).map_err(refused)?.assignment.col_of_row
             }
             SchedulerKind::Greedy => greedy_allowed(target, rows, cols).map_err(refused)?.col_of_row,
             SchedulerKind::Random => {
