@@ -1,9 +1,9 @@
-//! The schedulers that need no training.
+//! The schedulers that need no training, for the episodes of a shard.
 
-use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind, TeamReply, TeamRequest};
-use magex_assign::{Solver, UNASSIGNED, cost_of, distances, greedy, random::random};
+use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind};
+use magex_assign::{Solver, bottleneck, cost_of, distances, greedy, random::random};
 use magex_core::keys::episode_keys;
-use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::rng::Stream;
 
 impl From<magex_assign::AssignError> for AssignError {
     fn from(error: magex_assign::AssignError) -> Self {
@@ -35,6 +35,7 @@ fn answer(
     let exact_cost = exact.cost;
     let goals = match kind {
         SchedulerKind::Exact | SchedulerKind::Learned => exact.col_of_row,
+        SchedulerKind::Makespan => bottleneck(costs, rows, cols)?.assignment.col_of_row,
         SchedulerKind::Greedy => greedy(costs, rows, cols)?.col_of_row,
         SchedulerKind::Random => random(rows, cols, stream)?,
     };
@@ -67,21 +68,4 @@ pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignErr
         reply.exact_costs.push(answer.exact_cost as f32);
     }
     Ok(reply)
-}
-
-/// Goals for one team.
-pub(crate) fn assign_team(kind: SchedulerKind, request: &TeamRequest) -> Result<TeamReply, AssignError> {
-    let costs = distances(&request.agents, &request.goals, request.dims)?;
-    let mut stream = Key::new(request.seed, Purpose::Request, &[]).stream();
-    let shape = (request.agent_count, request.goal_count);
-    let answer = answer(kind, &mut Solver::default(), &costs, shape, &mut stream)?;
-    let goals = answer.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
-    Ok(TeamReply { goals, probabilities: None })
-}
-
-/// Summed distance of the least-cost assignment of a team, and all distances `[N, G]`.
-pub(crate) fn exact_cost(request: &TeamRequest) -> Result<(f64, Vec<f64>), AssignError> {
-    let costs = distances(&request.agents, &request.goals, request.dims)?;
-    let exact = Solver::default().solve(&costs, request.agent_count, request.goal_count)?;
-    Ok((exact.cost, costs))
 }

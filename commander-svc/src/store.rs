@@ -12,7 +12,7 @@ const KEPT: usize = 4;
 /// One version of the weights, made into a scheduler; or why that was not possible.
 #[derive(Clone)]
 pub(crate) struct Model {
-    pub(crate) key: WeightsKey,
+    pub(crate) key: Arc<WeightsKey>,
     pub(crate) scheduler: Result<Arc<dyn Scheduler>, String>,
 }
 
@@ -42,8 +42,8 @@ impl Store {
         });
     }
 
-    /// The newest model that can answer.
-    pub(crate) fn latest(&self) -> Option<(WeightsKey, Arc<dyn Scheduler>)> {
+    /// The newest model that can answer. Whoever holds it answers from this version alone, whatever comes in meanwhile.
+    pub(crate) fn latest(&self) -> Option<(Arc<WeightsKey>, Arc<dyn Scheduler>)> {
         let models = self.models.borrow();
         models.iter().rev().find_map(|model| Some((model.key.clone(), model.scheduler.as_ref().ok()?.clone())))
     }
@@ -51,7 +51,7 @@ impl Store {
     /// The model of this name, as soon as it is here, for at most `patience`.
     pub(crate) async fn wait(&self, key: &WeightsKey, patience: Duration) -> Option<Model> {
         let mut models = self.models.subscribe();
-        let find = |models: &Vec<Model>| models.iter().find(|model| model.key == *key).cloned();
+        let find = |models: &Vec<Model>| models.iter().find(|model| *model.key == *key).cloned();
         let arrived = models.wait_for(|models| find(models).is_some());
         let models = tokio::time::timeout(patience, arrived).await.ok()?.ok()?;
         find(&models)

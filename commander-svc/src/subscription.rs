@@ -73,5 +73,5 @@ pub(crate) async fn load(weights: Weights, toml: String, store: &Store, load_sch
         Ok(_) => tracing::debug!(version = key.version.0, "a model is ready"),
         Err(reason) => tracing::error!(version = key.version.0, reason, "weights cannot be used"),
     }
-    store.insert(Model { key, scheduler });
+    store.insert(Model { key: Arc::new(key), scheduler });
 }

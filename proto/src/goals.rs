@@ -17,6 +17,8 @@ pub enum SchedulerKind {
     Greedy,
     /// A uniformly random matching.
     Random,
+    /// The smallest largest distance.
+    Makespan,
 }
 
 impl fmt::Display for SchedulerKind {
@@ -26,6 +28,7 @@ impl fmt::Display for SchedulerKind {
             Self::Exact => "exact",
             Self::Greedy => "greedy",
             Self::Random => "random",
+            Self::Makespan => "makespan",
         })
     }
 }
@@ -37,6 +40,7 @@ impl From<SchedulerKind> for v1::SchedulerKind {
             SchedulerKind::Exact => Self::Exact,
             SchedulerKind::Greedy => Self::Greedy,
             SchedulerKind::Random => Self::Random,
+            SchedulerKind::Makespan => Self::ExactMakespan,
         }
     }
 }
@@ -48,6 +52,7 @@ impl From<v1::SchedulerKind> for SchedulerKind {
             v1::SchedulerKind::Exact => Self::Exact,
             v1::SchedulerKind::Greedy => Self::Greedy,
             v1::SchedulerKind::Random => Self::Random,
+            v1::SchedulerKind::ExactMakespan => Self::Makespan,
         }
     }
 }

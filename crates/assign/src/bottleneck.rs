@@ -5,7 +5,7 @@
 //! among the assignments with the smallest largest cost, the one with the smallest sum.
 
 use crate::greedy::ascending;
-use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_costs, cost_of};
+use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_allowed, check_costs, cost_of};
 
 const NONE: u32 = u32::MAX;
 
@@ -14,8 +14,17 @@ const NONE: u32 = u32::MAX;
 pub struct Bottleneck {
     /// The matching and its summed cost, the smallest among those with this `largest`.
     pub assignment: Assignment,
-    /// The smallest possible largest cost.
+    /// The smallest possible largest cost; −∞ if no pair is allowed.
     pub largest: f64,
+}
+
+/// The solver's memory. Reusing one allocates nothing but the answers.
+#[derive(Debug, Default)]
+pub struct BottleneckSolver {
+    solver: Solver,
+    matcher: Matcher,
+    /// The costs, sorted; later the costs up to the threshold.
+    values: Vec<f64>,
 }
 
 /// Solves the bottleneck problem for `cost`, row-major `[rows, cols]`.
@@ -24,59 +33,88 @@ pub struct Bottleneck {
 /// As [`Solver::solve`].
 pub fn bottleneck(cost: &[f64], rows: usize, cols: usize) -> Result<Bottleneck, AssignError> {
     check_costs(cost, rows, cols)?;
-    let pairs = rows.min(cols);
-    let mut values = cost.to_vec();
-    values.sort_unstable_by_key(|&value| ascending(value));
-    values.dedup();
-    let mut matcher = Matcher::default();
-    let (mut low, mut high) = (0, values.len() - 1);
-    while low < high {
-        let middle = low + (high - low) / 2;
-        if matcher.run(cost, rows, cols, values[middle]) == pairs {
-            high = middle;
-        } else {
-            low = middle + 1;
-        }
-    }
-    let largest = values[low];
-    let assignment = cheapest_within(cost, rows, cols, largest, values.get(low + 1).copied(), values[0])?;
-    // Rounding of the penalty could only matter at the edge of the number range; the matching is the safe answer.
-    if assignment.pairs().all(|(row, col)| cost[row * cols + col] <= largest) {
-        return Ok(Bottleneck { assignment, largest });
-    }
-    matcher.run(cost, rows, cols, largest);
-    let col_of_row = matcher.col_of_row;
-    let sum = cost_of(cost, cols, &col_of_row);
-    Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
+    BottleneckSolver::default().search(cost, rows, cols, &|| true)
 }
 
-/// The cheapest assignment without the pairs above `largest`: they get a price that no sum of the others reaches.
-fn cheapest_within(
-    cost: &[f64],
-    rows: usize,
-    cols: usize,
-    largest: f64,
-    next: Option<f64>,
-    least: f64,
-) -> Result<Assignment, AssignError> {
-    let mut solver = Solver::default();
-    let Some(next) = next else {
-        return solver.solve(cost, rows, cols);
-    };
-    let penalty = (largest + (rows.min(cols) + 1) as f64 * (largest - least)).max(next).min(crate::LARGEST_COST);
-    let masked: Vec<f64> = cost.iter().map(|&value| if value <= largest { value } else { penalty }).collect();
-    let mut answer = solver.solve(&masked, rows, cols)?;
-    answer.cost = cost_of(cost, cols, &answer.col_of_row);
-    Ok(answer)
+impl BottleneckSolver {
+    /// [`bottleneck`] where a cost of +∞ forbids a pair: as many pairs as possible, among those the smallest largest
+    /// cost, and among those the smallest sum. Gives up as soon as `go_on` says no.
+    ///
+    /// # Errors
+    /// As [`Solver::solve_allowed`].
+    pub fn solve_allowed(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Bottleneck, AssignError> {
+        check_allowed(cost, rows, cols)?;
+        self.search(cost, rows, cols, go_on)
+    }
+
+    /// Gives back the memory of a problem of more than `cells` pairs.
+    pub fn forget_beyond(&mut self, cells: usize) {
+        if self.values.capacity() > cells {
+            *self = Self::default();
+        }
+    }
+
+    fn search(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Bottleneck, AssignError> {
+        let Self { solver, matcher, values } = self;
+        values.clear();
+        values.extend(cost.iter().copied().filter(|&value| value < f64::INFINITY));
+        if values.is_empty() {
+            let assignment = Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 };
+            return Ok(Bottleneck { assignment, largest: f64::NEG_INFINITY });
+        }
+        let none_forbidden = values.len() == cost.len();
+        values.sort_unstable_by_key(|&value| ascending(value));
+        values.dedup();
+        let pairs = match none_forbidden {
+            true => rows.min(cols),
+            false => matcher.run(cost, rows, cols, values[values.len() - 1]),
+        };
+        let (mut low, mut high) = (0, values.len() - 1);
+        while low < high {
+            if !go_on() {
+                return Err(AssignError::Interrupted);
+            }
+            let middle = low + (high - low) / 2;
+            if matcher.run(cost, rows, cols, values[middle]) == pairs {
+                high = middle;
+            } else {
+                low = middle + 1;
+            }
+        }
+        let largest = values[low];
+        values.clear();
+        values.extend(cost.iter().map(|&value| if value <= largest { value } else { f64::INFINITY }));
+        let assignment = solver.solve_allowed(values, rows, cols, go_on)?;
+        // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
+        if assignment.pairs().count() == pairs {
+            return Ok(Bottleneck { assignment, largest });
+        }
+        matcher.run(cost, rows, cols, largest);
+        let col_of_row = matcher.col_of_row.clone();
+        let sum = cost_of(cost, cols, &col_of_row);
+        Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
+    }
 }
 
 /// Hopcroft–Karp on the pairs with a cost up to a threshold.
-#[derive(Default)]
-struct Matcher {
+#[derive(Debug, Default)]
+pub(crate) struct Matcher {
     edges: Vec<u32>,
     /// `[rows + 1]` where each row's edges start.
     start: Vec<usize>,
-    col_of_row: Vec<u32>,
+    pub(crate) col_of_row: Vec<u32>,
     row_of_col: Vec<u32>,
     layer: Vec<u32>,
     queue: Vec<u32>,
@@ -87,7 +125,7 @@ struct Matcher {
 
 impl Matcher {
     /// Size of the largest matching.
-    fn run(&mut self, cost: &[f64], rows: usize, cols: usize, threshold: f64) -> usize {
+    pub(crate) fn run(&mut self, cost: &[f64], rows: usize, cols: usize, threshold: f64) -> usize {
         self.edges.clear();
         self.start.clear();
         self.start.push(0);
@@ -95,8 +133,10 @@ impl Matcher {
             self.edges.extend((0..cols as u32).filter(|&col| row[col as usize] <= threshold));
             self.start.push(self.edges.len());
         }
-        self.col_of_row = vec![UNASSIGNED; rows];
-        self.row_of_col = vec![NONE; cols];
+        self.col_of_row.clear();
+        self.col_of_row.resize(rows, UNASSIGNED);
+        self.row_of_col.clear();
+        self.row_of_col.resize(cols, NONE);
         let mut matched = 0;
         while self.layers(rows) {
             self.cursor.clear();

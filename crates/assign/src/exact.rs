@@ -9,7 +9,7 @@
 //! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
 //! lowest index, free columns first: the answer is a function of the input alone.
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_costs, compensated_sum, distances_into};
+use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, compensated_sum, distances_into};
 
 const NONE: u32 = u32::MAX;
 /// Columns are padded to whole groups of this size; each scan keeps this many independent minima.
@@ -69,15 +69,51 @@ impl Solver {
     /// Empty or mismatched shapes, and the first entry that is NaN, infinite or beyond 1e300.
     pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
         check_costs(cost, rows, cols)?;
+        self.solve_checked(cost, rows, cols, None, &|| true)
+    }
+
+    /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
+    /// Gives up as soon as `go_on` says no; it is asked once per agent that is hard to place.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`], and [`AssignError::Interrupted`].
+    pub fn solve_allowed(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Assignment, AssignError> {
+        let span = check_allowed(cost, rows, cols)?;
+        let penalty = if span.forbidden == 0 { None } else { Some(span.penalty(rows.min(cols))) };
+        self.solve_checked(cost, rows, cols, penalty, go_on)
+    }
+
+    /// Solves what was checked, with `penalty` in the place of +∞; pairs that paid it are taken out again.
+    fn solve_checked(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        penalty: Option<f64>,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Assignment, AssignError> {
         let wide = rows <= cols;
-        self.load(cost, rows, cols);
-        self.run(rows.min(cols), rows.max(cols));
-        let col_of_row = if wide {
+        self.load(cost, rows, cols, penalty);
+        self.run(rows.min(cols), rows.max(cols), go_on)?;
+        let mut col_of_row: Vec<u32> = if wide {
             self.col_of_row.clone()
         } else {
             // Solved as the transpose: the solver's columns are our rows, its padding is not.
             self.row_of_col[..rows].iter().map(|&col| if col == NONE { UNASSIGNED } else { col }).collect()
         };
+        if penalty.is_some() {
+            for (row, col) in col_of_row.iter_mut().enumerate() {
+                if *col != UNASSIGNED && cost[row * cols + *col as usize] == f64::INFINITY {
+                    *col = UNASSIGNED;
+                }
+            }
+        }
         let cost = compensated_sum(crate::pairs(&col_of_row).map(|(row, col)| cost[row * cols + col]));
         Ok(Assignment { col_of_row, cost })
     }
@@ -94,8 +130,8 @@ impl Solver {
         answer
     }
 
-    /// Copies the costs, transposed if there are more rows than columns, and pads every row.
-    fn load(&mut self, cost: &[f64], rows: usize, cols: usize) {
+    /// Copies the costs, transposed if there are more rows than columns, and pads every row. Forbidden pairs get a price.
+    fn load(&mut self, cost: &[f64], rows: usize, cols: usize, penalty: Option<f64>) {
         let (short, long) = (rows.min(cols), rows.max(cols));
         self.stride = long.next_multiple_of(LANES);
         self.cost.clear();
@@ -106,11 +142,16 @@ impl Solver {
             } else {
                 self.cost.extend((0..rows).map(|i| cost[i * cols + row]));
             }
+            if let Some(penalty) = penalty {
+                for value in &mut self.cost[row * self.stride..] {
+                    *value = if *value == f64::INFINITY { penalty } else { *value };
+                }
+            }
             self.cost.resize((row + 1) * self.stride, f64::INFINITY);
         }
     }
 
-    fn run(&mut self, rows: usize, cols: usize) {
+    fn run(&mut self, rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<(), AssignError> {
         let stride = self.stride;
         refill(&mut self.price, stride, 0.0);
         refill(&mut self.row_of_col, stride, NONE);
@@ -118,7 +159,7 @@ impl Solver {
         if cols == 1 {
             self.row_of_col[0] = 0;
             self.col_of_row[0] = 0;
-            return;
+            return Ok(());
         }
         if rows == cols {
             self.reduce_columns(cols);
@@ -126,11 +167,20 @@ impl Solver {
         self.free.clear();
         self.free.extend((0..rows as u32).filter(|&row| self.col_of_row[row as usize] == NONE));
         self.reduce_rows(rows);
-        let free = std::mem::take(&mut self.free);
-        for &row in &free {
-            self.augment(row);
+        for next in 0..self.free.len() {
+            if !go_on() {
+                return Err(AssignError::Interrupted);
+            }
+            self.augment(self.free[next]);
         }
-        self.free = free;
+        Ok(())
+    }
+
+    /// Gives back the memory of a problem of more than `cells` pairs.
+    pub fn forget_beyond(&mut self, cells: usize) {
+        if self.cost.capacity() > cells {
+            *self = Self::default();
+        }
     }
 
     /// Column reduction: each column takes the price of its cheapest row, and the row if nobody has it yet. Then the

@@ -18,9 +18,9 @@ pub mod greedy;
 pub mod random;
 pub mod two_swap;
 
-pub use bottleneck::bottleneck;
+pub use bottleneck::{BottleneckSolver, bottleneck};
 pub use exact::{Solver, exact, exact_points};
-pub use greedy::greedy;
+pub use greedy::{greedy, greedy_allowed};
 
 /// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).
 pub const UNASSIGNED: u32 = u32::MAX;
@@ -79,6 +79,9 @@ pub enum AssignError {
         /// The coordinate.
         value: f32,
     },
+    /// The caller did not want the answer any more.
+    #[error("given up before the answer was found")]
+    Interrupted,
     /// A number that steers an algorithm is out of range.
     #[error("{field}: {value} is out of range; {remedy}")]
     Parameter {
@@ -149,6 +152,51 @@ pub fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<(), AssignE
     Err(AssignError::Entry { row: place / cols, col: place % cols, value: cost[place] })
 }
 
+/// What [`check_allowed`] learns about a matrix in which +∞ forbids a pair.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Span {
+    /// Forbidden pairs.
+    pub(crate) forbidden: usize,
+    /// Least cost of the others; +∞ if there are none.
+    pub(crate) least: f64,
+    /// Largest cost of the others; −∞ if there are none.
+    pub(crate) largest: f64,
+}
+
+impl Span {
+    /// A price for forbidden pairs, so high that one of them costs more than any `pairs` others could save. Low enough
+    /// that the others keep their digits.
+    pub(crate) fn penalty(&self, pairs: usize) -> f64 {
+        if self.least > self.largest {
+            return 1.0;
+        }
+        let range = self.largest - self.least;
+        let step = range.max(self.largest.abs() * 1e-9).max(f64::MIN_POSITIVE);
+        (self.largest + pairs as f64 * range + step).min(LARGEST_COST)
+    }
+}
+
+/// Checks shape and entries of a cost matrix `[rows, cols]` in which +∞ forbids a pair.
+pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Span, AssignError> {
+    check_shape(rows, cols)?;
+    let expected = rows.saturating_mul(cols);
+    if cost.len() != expected {
+        return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
+    }
+    let mut span = Span { forbidden: 0, least: f64::INFINITY, largest: f64::NEG_INFINITY };
+    for (place, &value) in cost.iter().enumerate() {
+        if usable(value) {
+            span.least = span.least.min(value);
+            span.largest = span.largest.max(value);
+        } else if value == f64::INFINITY {
+            span.forbidden += 1;
+        } else {
+            return Err(AssignError::Entry { row: place / cols, col: place % cols, value });
+        }
+    }
+    Ok(span)
+}
+
 /// False for NaN too.
 fn usable(cost: f64) -> bool {
     cost.abs() <= LARGEST_COST
@@ -172,7 +220,10 @@ pub fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>,
 }
 
 /// [`distances`] into a buffer that is reused; returns (rows, cols).
-pub(crate) fn distances_into(
+///
+/// # Errors
+/// As [`distances`].
+pub fn distances_into(
     agents: &[f32],
     goals: &[f32],
     dims: usize,

@@ -1,6 +1,7 @@
 //! Random assignment: the lower bound a commander is measured against.
 
-use crate::{AssignError, UNASSIGNED, check_shape};
+use crate::bottleneck::Matcher;
+use crate::{AssignError, UNASSIGNED, check_allowed, check_shape};
 use magex_core::rng::Stream;
 
 /// A uniformly random matching of min(rows, cols) pairs: the column of each row, or [`UNASSIGNED`].
@@ -15,6 +16,31 @@ pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>,
         // With more rows than columns, the numbers beyond the last column are the places without a partner.
         if *col >= cols as u32 {
             *col = UNASSIGNED;
+        }
+    }
+    Ok(col_of_row)
+}
+
+/// A random matching of as many pairs as possible where a cost of +∞ forbids a pair; uniform only if none is forbidden.
+///
+/// # Errors
+/// As [`crate::Solver::solve_allowed`].
+pub fn random_allowed(cost: &[f64], rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>, AssignError> {
+    if check_allowed(cost, rows, cols)?.forbidden == 0 {
+        return random(rows, cols, stream);
+    }
+    // A largest matching of a shuffled problem.
+    let (row_order, col_order) = (stream.permutation(rows), stream.permutation(cols));
+    let entry =
+        |row: &u32, col: &u32| if cost[*row as usize * cols + *col as usize] < f64::INFINITY { 0.0 } else { 1.0 };
+    let shuffled: Vec<f64> =
+        row_order.iter().flat_map(|row| col_order.iter().map(move |col| entry(row, col))).collect();
+    let mut matcher = Matcher::default();
+    matcher.run(&shuffled, rows, cols, 0.0);
+    let mut col_of_row = vec![UNASSIGNED; rows];
+    for (place, &row) in row_order.iter().enumerate() {
+        if let Some(&col) = col_order.get(matcher.col_of_row[place] as usize) {
+            col_of_row[row as usize] = col;
         }
     }
     Ok(col_of_row)

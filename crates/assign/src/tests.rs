@@ -78,6 +78,18 @@ fn entry() -> impl Strategy<Value = f64> {
     ]
 }
 
+#[test]
+fn a_solver_that_is_told_to_stop_stops_and_can_be_used_again() {
+    let (agents, goals) = uniform_points(60, 1);
+    let cost = distances(&agents, &goals, 2).unwrap();
+    let mut solver = Solver::default();
+    assert_eq!(solver.solve_allowed(&cost, 60, 60, &|| false), Err(AssignError::Interrupted));
+    assert_eq!(solver.solve_allowed(&cost, 60, 60, &|| true), exact(&cost, 60, 60));
+    assert!(solver.solve_allowed(&[f64::NEG_INFINITY], 1, 1, &|| true).is_err());
+    assert!(solver.solve_allowed(&[f64::NAN], 1, 1, &|| true).is_err());
+    assert_eq!(solver.solve_allowed(&[f64::INFINITY; 2], 2, 1, &|| true).unwrap().col_of_row, [UNASSIGNED; 2]);
+}
+
 fn small_problem() -> impl Strategy<Value = Problem> {
     let entries = |rows: usize, cols: usize| prop::collection::vec(entry(), rows * cols);
     let mixed = (1usize..=6, 1usize..=6).prop_flat_map(move |(r, c)| (Just(r), Just(c), entries(r, c)));
@@ -86,8 +98,54 @@ fn small_problem() -> impl Strategy<Value = Problem> {
     prop_oneof![3 => mixed, 1 => plain]
 }
 
+/// (pairs, smallest sum, smallest largest cost, smallest sum among those with it) over the largest matchings without
+/// forbidden pairs.
+fn brute_force_allowed((rows, cols, cost): &Problem) -> (usize, f64, f64, f64) {
+    let mut best = (0, 0.0, f64::NEG_INFINITY, 0.0);
+    every_matching(*rows.min(cols), *rows.max(cols), &mut Vec::new(), &mut |chosen| {
+        let entry = |(a, &b): (usize, &usize)| if rows <= cols { cost[a * cols + b] } else { cost[b * cols + a] };
+        let entries = || chosen.iter().enumerate().map(entry).filter(|c| c.is_finite());
+        let (pairs, sum) = (entries().count(), compensated_sum(entries()));
+        let top = entries().fold(f64::NEG_INFINITY, f64::max);
+        if pairs > best.0 {
+            best = (pairs, sum, top, sum);
+        } else if pairs == best.0 {
+            best.1 = sum.min(best.1);
+            if top < best.2 || (top == best.2 && sum < best.3) {
+                (best.2, best.3) = (top, sum);
+            }
+        }
+    });
+    best
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(400) })]
+
+    #[test]
+    fn forbidden_pairs_agree_with_brute_force(
+        (rows, cols, mut cost) in small_problem(), share in 0u32..=10, seed in 0u32..1000
+    ) {
+        let mut chance = stream(seed);
+        cost.iter_mut().filter(|_| chance.below(10) < share).for_each(|c| *c = f64::INFINITY);
+        let finite: Vec<f64> = cost.iter().copied().filter(|c| c.is_finite()).collect();
+        let problem = (rows, cols, cost);
+        let (pairs, sum, largest, within) = brute_force_allowed(&problem);
+        let cost = &problem.2;
+        let allowed = |a: &Assignment| a.pairs().all(|(row, col)| cost[row * cols + col].is_finite());
+        let answer = Solver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
+        prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
+        prop_assert!(close(answer.cost, sum, &finite), "{} instead of {sum}", answer.cost);
+        let answer = BottleneckSolver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
+        prop_assert!(allowed(&answer.assignment) && answer.assignment.pairs().count() == pairs);
+        prop_assert_eq!(answer.largest, largest);
+        prop_assert!(close(answer.assignment.cost, within, &finite), "{} not {within}", answer.assignment.cost);
+        let answer = greedy_allowed(cost, rows, cols).unwrap();
+        prop_assert!(allowed(&answer) && 2 * answer.pairs().count() >= pairs);
+        let col_of_row = random::random_allowed(cost, rows, cols, &mut chance).unwrap();
+        let answer = Assignment { cost: 0.0, col_of_row };
+        prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
+    }
 
     #[test]
     fn small_problems_agree_with_brute_force(problem in small_problem()) {

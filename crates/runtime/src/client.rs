@@ -1,24 +1,39 @@
 //! Connecting to a service.
 
+use crate::tls::ClientTls;
 use std::time::Duration;
 use tonic::transport::{Channel, Endpoint};
 
 /// A url that cannot be connected to, whatever runs there.
 #[derive(Debug, thiserror::Error)]
-#[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port")]
+#[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
 pub struct UrlError {
     url: String,
     reason: String,
 }
 
-/// An endpoint with our settings: a peer that is gone is noticed within 15 s even when nothing is being said.
+/// An endpoint with our settings. For an https url the certificates are those that the environment names
+/// ([`ClientTls::from_env`]).
 pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
+    let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
+    let tls = secure.then(ClientTls::from_env).transpose();
+    let tls = tls.map_err(|error| UrlError { url: url.to_owned(), reason: error.to_string() })?;
+    endpoint_with(url, tls.as_ref())
+}
+
+/// An endpoint with our settings: a peer that is gone is noticed within 15 s even when nothing is being said.
+pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
     let wrong = |reason: String| UrlError { url: url.to_owned(), reason };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;
-    match endpoint.uri().scheme_str() {
-        Some("http") if endpoint.uri().host().is_some() => {}
+    let endpoint = match (endpoint.uri().scheme_str(), tls) {
+        (Some("http"), None) if endpoint.uri().host().is_some() => endpoint,
+        (Some("https"), Some(tls)) if endpoint.uri().host().is_some() => {
+            endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?
+        }
+        (Some("http"), Some(_)) => return Err(wrong("certificates need an https url".to_owned())),
+        (Some("https"), None) => return Err(wrong("https needs certificates".to_owned())),
         _ => return Err(wrong("not an http url".to_owned())),
-    }
+    };
     Ok(endpoint
         .connect_timeout(Duration::from_secs(3))
         .tcp_nodelay(true)

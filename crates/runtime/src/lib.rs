@@ -1,4 +1,4 @@
-//! What every service needs and no domain type: logs, shutdown, sockets, servers, clients, health, retries.
+//! What every service needs and no domain type: logs, shutdown, sockets, TLS, servers, clients, health, retries.
 
 pub mod backoff;
 pub mod client;
@@ -9,3 +9,4 @@ pub mod server;
 pub mod shutdown;
 pub mod status;
 pub mod telemetry;
+pub mod tls;

@@ -1,5 +1,6 @@
 //! Listening and serving.
 
+use crate::tls::{ServerTls, TlsError};
 use std::future::Future;
 use std::io::{Error, ErrorKind};
 use std::net::{SocketAddr, ToSocketAddrs as _};
@@ -40,8 +41,7 @@ pub enum BindError {
 
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
 pub async fn bind(listen: &str) -> Result<(TcpIncoming, SocketAddr), BindError> {
-    let wrong = || BindError::Address(listen.to_owned());
-    let address = listen.to_socket_addrs().map_err(|_| wrong())?.next().ok_or_else(wrong)?;
+    let address = resolve(listen)?;
     let failed = |source: Error| match source.kind() {
         ErrorKind::AddrInUse => BindError::InUse { address: listen.to_owned(), port: address.port() },
         _ => BindError::Other { address: listen.to_owned(), source },
@@ -64,6 +64,26 @@ pub fn builder() -> Server {
         .max_concurrent_streams(256)
         .initial_stream_window_size(8 << 20)
         .initial_connection_window_size(16 << 20)
+}
+
+/// [`builder`], with TLS if there are certificates.
+///
+/// # Errors
+/// Certificates that cannot be used.
+pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, TlsError> {
+    match tls {
+        Some(tls) => builder().tls_config(tls.config()).map_err(|error| TlsError::Unusable(error.to_string())),
+        None => Ok(builder()),
+    }
+}
+
+/// The address that `host:port` stands for.
+///
+/// # Errors
+/// It makes no sense.
+pub fn resolve(listen: &str) -> Result<SocketAddr, BindError> {
+    let wrong = || BindError::Address(listen.to_owned());
+    listen.to_socket_addrs().map_err(|_| wrong())?.next().ok_or_else(wrong)
 }
 
 /// Serves until `shutdown`, then stops accepting, waits for open calls for at most `grace`, and leaves the rest.

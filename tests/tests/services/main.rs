@@ -3,11 +3,15 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "helpers of tests")]
 
+mod clients;
 mod commander;
 mod elastic;
 mod handshake;
+mod missions;
 mod results;
 mod sandbox;
+mod security;
 mod speed;
 mod stopping;
+mod swaps;
 mod weights;

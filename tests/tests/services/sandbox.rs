@@ -4,7 +4,9 @@ use bytes::Bytes;
 use magex_actor::goals::{GoalRequest, GoalSource};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
-use magex_commander::scheduler::{AssignError, GoalReply, Scheduler, SchedulerKind, TeamReply, TeamRequest};
+use magex_commander::scheduler::{
+    AssignError, GoalReply, LoadScheduler, Scheduler, SchedulerKind, TeamReply, TeamRequest,
+};
 use magex_commander::service::CommanderConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
@@ -14,6 +16,7 @@ use magex_learner::collector::{CollectError, Collector, GrpcCollector};
 use magex_learner::ingest::Limits;
 use magex_learner::service::{LearnerHandle, RunIdentity, learner_service};
 use magex_proto::convert::encode_result;
+use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
@@ -373,10 +376,14 @@ pub(crate) struct Commander {
 
 impl Commander {
     pub(crate) async fn start(listen: &str, learner_url: Option<&str>) -> Self {
+        let learner_url = learner_url.map(Into::into);
+        Self::start_with(listen, CommanderConfig { learner_url, ..CommanderConfig::default() }, load_fake).await
+    }
+
+    pub(crate) async fn start_with(listen: &str, config: CommanderConfig, load: LoadScheduler) -> Self {
         let (incoming, address) = server::bind(listen).await.unwrap();
         let shutdown = CancellationToken::new();
-        let config = CommanderConfig { learner_url: learner_url.map(Into::into), model: None };
-        let run = magex_commander::service::run(config, load_fake, incoming, shutdown.clone());
+        let run = magex_commander::service::run(config, load, incoming, shutdown.clone());
         let serving = tokio::spawn(async move { run.await.unwrap() });
         Self { url: format!("http://{address}"), shutdown, serving }
     }
@@ -385,6 +392,19 @@ impl Commander {
         self.shutdown.cancel();
         within(self.serving).await.unwrap();
     }
+}
+
+/// A run folder with these bytes as weights.
+pub(crate) fn run_folder(bytes: &[u8]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("weights.safetensors"), bytes).unwrap();
+    std::fs::write(folder.path().join("config.toml"), "").unwrap();
+    folder
+}
+
+/// A client of a commander.
+pub(crate) async fn commander_client(url: &str) -> CommanderServiceClient<Channel> {
+    CommanderServiceClient::new(client::endpoint(url).unwrap().connect().await.unwrap())
 }
 
 /// An address that nobody listens on for now.

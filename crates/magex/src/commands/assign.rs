@@ -7,12 +7,14 @@ use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
+use magex_runtime::tls::ClientTls;
 use magex_runtime::{client, exit};
 use serde::Deserialize;
 use serde_json::json;
 use std::io::Read as _;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use tonic::{Code, Status};
+use tonic::{Code, Request, Status};
 
 const AFTER_HELP: &str = "\
 Examples:
@@ -35,6 +37,18 @@ pub(crate) struct AssignArgs {
     /// The commander's address.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7100", env = "MAGEX_COMMANDER")]
     pub(crate) connect: String,
+    /// Bearer token, if the commander wants one.
+    #[arg(long, value_name = "TOKEN", env = "MAGEX_TOKEN", hide_env_values = true)]
+    pub(crate) token: Option<String>,
+    /// Authority (PEM) that signed the certificate of an https commander.
+    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_CA")]
+    pub(crate) ca: Option<PathBuf>,
+    /// Own certificate (PEM), if the commander wants one.
+    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_CERT", requires = "key")]
+    pub(crate) cert: Option<PathBuf>,
+    /// Key of that certificate (PEM).
+    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_KEY", requires = "cert")]
+    pub(crate) key: Option<PathBuf>,
     /// Positions of the agents: JSON, a file, or - for standard input; a team file brings the goals too.
     #[arg(long, value_name = "FILE|JSON|-", required_unless_present = "random", conflicts_with = "random")]
     pub(crate) agents: Option<String>,
@@ -66,6 +80,8 @@ pub(crate) enum Kind {
     Greedy,
     /// A random matching.
     Random,
+    /// The smallest largest distance.
+    Makespan,
 }
 
 /// How goals are chosen.
@@ -99,7 +115,19 @@ pub(crate) fn run(args: &AssignArgs, global: &Global) -> anyhow::Result<u8> {
         seed: args.seed,
         ..Default::default()
     };
-    let endpoint = client::endpoint(&args.connect).map_err(|error| usage(format!("--connect: {error}")))?;
+    let tls = args.ca.as_deref().filter(|_| args.connect.starts_with("https:"));
+    let tls =
+        tls.map(|ca| ClientTls::read(ca, args.cert.as_deref(), args.key.as_deref())).transpose().map_err(usage)?;
+    let endpoint = client::endpoint_with(&args.connect, tls.as_ref());
+    let endpoint = endpoint.map_err(|error| match args.ca.is_none() && args.connect.starts_with("https:") {
+        true => usage(format!("--connect: {error}; name the authority of its certificate with --ca")),
+        false => usage(format!("--connect: {error}")),
+    })?;
+    let mut request = Request::new(request);
+    if let Some(token) = &args.token {
+        let value = format!("Bearer {token}").parse().map_err(|_| usage("--token: it must be printable ASCII"))?;
+        request.metadata_mut().insert("authorization", value);
+    }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let clock = Instant::now();
     let response = runtime.block_on(async {
@@ -156,10 +184,11 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         }
     };
     output.say(format!(
-        "\n  summed distance {:.4}, least possible {:.4}, gap {:.2} %\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        "\n  summed distance {:.4}, least possible {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
         response.cost,
-        response.exact_cost,
-        100.0 * response.gap,
+        response.exact_cost.map_or_else(|| "not computed".into(), |cost| format!("{cost:.4}")),
+        response.gap.map_or_else(|| "unknown".into(), |gap| format!("{:.2} %", 100.0 * gap)),
+        response.largest_cost,
         1e3 * response.seconds,
         1e3 * round_trip
     ));
@@ -179,6 +208,7 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         "cost": response.cost,
         "exact_cost": response.exact_cost,
         "gap": response.gap,
+        "largest_cost": response.largest_cost,
         "scheduler": answered,
         "version": response.version,
         "weights_sha256": response.sha256,
@@ -195,6 +225,7 @@ fn scheduler(kind: Kind) -> v1::SchedulerKind {
         Kind::Exact => v1::SchedulerKind::Exact,
         Kind::Greedy => v1::SchedulerKind::Greedy,
         Kind::Random => v1::SchedulerKind::Random,
+        Kind::Makespan => v1::SchedulerKind::ExactMakespan,
     }
 }
 
@@ -204,6 +235,7 @@ fn kind_name(kind: v1::SchedulerKind) -> &'static str {
         v1::SchedulerKind::Exact => "exact",
         v1::SchedulerKind::Greedy => "greedy",
         v1::SchedulerKind::Random => "random",
+        v1::SchedulerKind::ExactMakespan => "makespan",
         v1::SchedulerKind::Unspecified => "unknown",
     }
 }

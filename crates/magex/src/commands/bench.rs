@@ -1,5 +1,6 @@
 //! `magex bench`: the tables of docs/results.md, measured on this machine.
 
+mod assign;
 mod goals;
 mod runs;
 mod speed;
@@ -15,6 +16,7 @@ const AFTER_HELP: &str = "\
 Examples:
   magex bench                                       env, update, assign and commander: a few minutes
   magex bench update --json
+  magex bench assign --run runs/mine --flood 60     solver, learned scheduler, service under load
   magex bench commander --run runs/mine
   magex bench train --agents 50 --seeds 1,2,3       trains and evaluates; the result table
   magex bench tasks --tasks drones-4                the same for Push Ball and the drones
@@ -40,8 +42,8 @@ enum What {
     Env(speed::EnvArgs),
     /// One PPO minibatch on one core.
     Update(speed::UpdateArgs),
-    /// Exact assignment.
-    Assign,
+    /// Goal assignment: solver, learned scheduler, and the service with its clients.
+    Assign(assign::AssignArgs),
     /// Cost of the commander's assignments over the exact ones.
     Commander(goals::CommanderArgs),
     /// Train the paper's ranking commander alone, on instances of each layout.
@@ -88,7 +90,7 @@ pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
         [
             What::Env(Default::default()),
             What::Update(Default::default()),
-            What::Assign,
+            What::Assign(Default::default()),
             What::Commander(Default::default()),
         ]
     };
@@ -101,7 +103,11 @@ pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
                 What::Train(Default::default()),
                 What::Tasks(Default::default()),
             ];
-            quick().into_iter().chain(long).collect()
+            let whole = |part| match part {
+                What::Assign(_) => What::Assign(assign::AssignArgs::whole()),
+                other => other,
+            };
+            quick().into_iter().map(whole).chain(long).collect()
         }
         Some(one) => vec![one.clone()],
     };
@@ -121,7 +127,7 @@ fn measure(what: &What) -> anyhow::Result<Report> {
     match what {
         What::Env(args) => speed::env(args),
         What::Update(args) => speed::update(args),
-        What::Assign => speed::assign(),
+        What::Assign(args) => assign::assign(args),
         What::Commander(args) => goals::commander(args),
         What::Ranking(args) => goals::ranking(args),
         What::Distributed(args) => runs::distributed(args),

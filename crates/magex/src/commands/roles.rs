@@ -34,13 +34,14 @@ Exit codes: 0 the run is complete or the actor was told to stop, 64 wrong usage,
 const COMMANDER_HELP: &str = "\
 Examples:
   magex commander --learner http://127.0.0.1:7000     follows a run
-  magex commander --model runs/mine                   serves a finished run
-  magex commander                                     exact, greedy and random only
+  magex commander --weights runs/mine                 serves a finished run
+  magex commander --data missions                     exact, makespan, greedy and random; missions are kept
+  magex commander --listen 0.0.0.0:7100 --tls-cert server.pem --tls-key server.key --identities who.toml
 
-Ask it with magex assign, or over gRPC (reflection is on).
+Ask it with magex assign, or over gRPC (reflection is on); docs/commander.md has more.
 
 Exit codes: 0 told to stop, 64 wrong usage or weights, 69 the port is in use, 70 a fault of this program,
-130 interrupted twice";
+73 --data cannot be used, 130 interrupted twice";
 
 /// Run the learner alone: leases work to actors, trains, broadcasts weights.
 #[derive(Debug, Clone, clap::Args)]
@@ -66,8 +67,8 @@ pub(crate) struct ActorRole {
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = COMMANDER_HELP)]
 pub(crate) struct CommanderRole {
-    /// Run folder to serve: its weights and its configuration.
-    #[arg(long, value_name = "RUN", conflicts_with = "weights")]
+    /// The same as --weights RUN
+    #[arg(long, value_name = "RUN", conflicts_with = "weights", hide = true)]
     model: Option<PathBuf>,
     #[command(flatten)]
     args: CommanderArgs,
@@ -104,7 +105,7 @@ pub(crate) fn commander(role: &CommanderRole) -> anyhow::Result<u8> {
     let mut args = role.args.clone();
     if let Some(run) = &role.model {
         folder::config_of(run)?;
-        (args.weights, args.config) = (Some(run.join(folder::WEIGHTS)), Some(run.join(folder::CONFIG)));
+        args.weights = Some(run.clone());
     }
     Ok(magex_commander::cli::run(args)?)
 }

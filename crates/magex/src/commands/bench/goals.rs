@@ -80,6 +80,13 @@ fn greedy_of(commander: &Commander) -> impl FnMut(&Team<'_>, u32) -> anyhow::Res
     }
 }
 
+/// Cost ratio of greedy decisions on unseen uniform instances: mean, worst, and the median time of a decision in µs.
+pub(super) fn learned_ratio(commander: &Commander, agents: usize, instances: u32) -> anyhow::Result<[f64; 3]> {
+    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
+    task.validate().map_err(crate::failure::usage)?;
+    ratios(&task, instances, greedy_of(commander))
+}
+
 pub(super) fn commander(args: &CommanderArgs) -> anyhow::Result<Report> {
     let title =
         format!("Assignment cost over the exact cost, {} unseen instances per row, greedy decisions", args.instances);

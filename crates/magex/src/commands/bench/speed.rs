@@ -3,7 +3,6 @@
 use super::Report;
 use crate::output::thousands;
 use crate::settings;
-use magex_assign::bench::time_exact;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_env::bench::{drone_throughput, throughput, throughput_of};
@@ -89,17 +88,6 @@ pub(super) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
             format!("{:.2}", time.update_ms),
         ];
         report.row(cells, json!({ "executor": kind, "agents": agents, "time": time }));
-    }
-    Ok(report)
-}
-
-pub(super) fn assign() -> anyhow::Result<Report> {
-    let title = "Exact assignment of N uniform agents to N goals, one core";
-    let mut report = Report::new("assign", title, 0, &["N", "median µs", "instances"]);
-    for (n, instances) in [(5, 2000), (20, 2000), (50, 1000), (200, 200), (1000, 20)] {
-        let time = time_exact(n, instances)?;
-        let cells = vec![n.to_string(), format!("{time:.1}"), instances.to_string()];
-        report.row(cells, json!({ "agents": n, "microseconds": time, "instances": instances }));
     }
     Ok(report)
 }

@@ -1,0 +1,135 @@
+//! The goals that were handed out to training episodes, kept for a while so that clients can look at them.
+
+use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
+use magex_core::ids::ShardKind;
+use magex_dispatch::view::Episode;
+use magex_proto::v1;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Shards that are kept, and numbers in them.
+const SHARDS: usize = 256;
+const NUMBERS: usize = 4 << 20;
+/// After so long nobody can call an episode live, milliseconds.
+const LIVE_MS: i64 = 600_000;
+
+/// A shard's episodes and what was handed out for them.
+#[derive(Debug)]
+pub(crate) struct TrainingShard {
+    request: Arc<GoalRequest>,
+    reply: Arc<GoalReply>,
+    key: WeightsKey,
+    at_ms: i64,
+}
+
+impl TrainingShard {
+    pub(crate) fn new(request: Arc<GoalRequest>, reply: Arc<GoalReply>, key: WeightsKey, at_ms: i64) -> Self {
+        Self { request, reply, key, at_ms }
+    }
+
+    /// Number of missions: every stage of every episode is one.
+    pub(crate) fn missions(&self) -> usize {
+        self.request.shard.episodes as usize * self.request.stages
+    }
+
+    /// Every stage of every episode as a mission.
+    pub(crate) fn assignments(&self) -> impl Iterator<Item = v1::Assignment> + '_ {
+        (0..self.missions()).filter_map(|place| self.assignment(place))
+    }
+
+    /// Names of the missions, in order.
+    fn names(&self) -> impl Iterator<Item = String> + '_ {
+        let prefix = format!("{}{}", magex_dispatch::mission::TRAINING_PREFIX, self.key.run_id);
+        (0..self.missions()).map(move |place| {
+            let (part, episode) = (self.part(place % self.request.stages), place / self.request.stages);
+            format!("{prefix}.{part}.{}", self.request.shard.first_episode + episode as u32)
+        })
+    }
+
+    fn part(&self, stage: usize) -> String {
+        let part = match self.request.shard.kind {
+            ShardKind::Train => format!("train-{}", self.request.shard.iteration),
+            ShardKind::Eval => format!("eval-{}", self.request.shard.eval_set),
+        };
+        if self.request.stages > 1 { format!("{part}-stage-{stage}") } else { part }
+    }
+
+    fn assignment(&self, place: usize) -> Option<v1::Assignment> {
+        let (request, reply) = (&*self.request, &*self.reply);
+        let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
+        let part = self.part(place % request.stages.max(1));
+        let episode = Episode {
+            run_id: &self.key.run_id.0,
+            part: &part,
+            index: request.shard.first_episode + (place / request.stages.max(1)) as u32,
+            dims: d,
+            agents: request.agents.get(place * n * d..(place + 1) * n * d)?,
+            goals: request.goals.get(place * g * d..(place + 1) * g * d)?,
+            goal_of: reply.goals.get(place * n..(place + 1) * n)?,
+            scheduler: request.scheduler,
+            version: self.key.version.0,
+            sha256: &self.key.sha256,
+            cost: f64::from(*reply.costs.get(place)?),
+            exact_cost: f64::from(*reply.exact_costs.get(place)?),
+            at_ms: self.at_ms,
+        };
+        Some(episode.assignment())
+    }
+
+    fn numbers(&self) -> usize {
+        self.request.agents.len() + self.request.goals.len() + self.reply.goals.len()
+    }
+}
+
+/// The latest shards.
+#[derive(Debug, Default)]
+pub(crate) struct Training {
+    shards: Mutex<VecDeque<Arc<TrainingShard>>>,
+}
+
+impl Training {
+    /// Keeps a shard; the oldest make room.
+    pub(crate) fn insert(&self, shard: Arc<TrainingShard>) {
+        let mut shards = self.lock();
+        // An actor that asks again gets the same answer: it is the same mission.
+        shards.retain(|old| old.request.shard != shard.request.shard || old.key.run_id != shard.key.run_id);
+        shards.push_back(shard);
+        let mut numbers: usize = shards.iter().map(|shard| shard.numbers()).sum();
+        while shards.len() > SHARDS || (numbers > NUMBERS && shards.len() > 1) {
+            numbers -= shards.pop_front().map_or(0, |shard| shard.numbers());
+        }
+    }
+
+    /// Shards that are still live at `now` (milliseconds since 1970), oldest first.
+    pub(crate) fn live(&self, now: i64) -> Vec<Arc<TrainingShard>> {
+        let mut shards = self.lock();
+        shards.retain(|shard| shard.at_ms + LIVE_MS > now);
+        shards.iter().cloned().collect()
+    }
+
+    /// The episode of this name.
+    pub(crate) fn get(&self, id: &str, now: i64) -> Option<v1::Assignment> {
+        self.live(now).iter().find_map(|shard| {
+            let b = shard.names().position(|name| name == id)?;
+            shard.assignment(b)
+        })
+    }
+
+    /// Up to `count` episodes after this name, by name.
+    pub(crate) fn page(&self, after: &str, count: usize, now: i64) -> Vec<v1::Assignment> {
+        let shards = self.live(now);
+        let mut names: Vec<(String, usize, usize)> = shards
+            .iter()
+            .enumerate()
+            .flat_map(|(k, shard)| shard.names().enumerate().map(move |(b, name)| (name, k, b)))
+            .filter(|(name, ..)| name.as_str() > after)
+            .collect();
+        names.sort_unstable();
+        names.dedup_by(|a, b| a.0 == b.0);
+        names.iter().take(count).filter_map(|&(_, k, b)| shards[k].assignment(b)).collect()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<TrainingShard>>> {
+        self.shards.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

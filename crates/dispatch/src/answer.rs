@@ -1,0 +1,76 @@
+//! A plan as an answer on the wire.
+
+use crate::UNASSIGNED;
+use crate::engine::Plan;
+use crate::problem::Problem;
+use magex_proto::v1;
+
+/// Writes the answer. Names of weights, the reason of a fallback and the time are the caller's.
+pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
+    let (n, g) = (problem.agent_count, problem.goal_count);
+    let mut response = v1::AssignResponse {
+        pairs: Vec::with_capacity(n.min(g)),
+        cost: plan.cost,
+        exact_cost: plan.exact_cost,
+        gap: gap(plan.cost, plan.exact_cost),
+        scheduler: v1::SchedulerKind::from(plan.scheduler).into(),
+        ..Default::default()
+    };
+    let mut free = vec![true; g];
+    let mut largest: Option<f64> = None;
+    for (agent, &goal) in plan.goal_of.iter().enumerate() {
+        if goal == UNASSIGNED {
+            response.unassigned_agents.push(agent as u32);
+            continue;
+        }
+        free[goal as usize] = false;
+        let cost = plan.pair_costs[agent];
+        largest = Some(largest.map_or(cost, |top| top.max(cost)));
+        let distance = match problem.matrix.is_none() && problem.overrides.is_empty() {
+            true => cost,
+            false => problem.distance(agent, goal as usize),
+        };
+        response.pairs.push(v1::Pair {
+            agent_index: agent as u32,
+            goal_index: goal,
+            agent_id: name(&problem.agent_ids, agent),
+            goal_id: name(&problem.goal_ids, goal as usize),
+            distance,
+            probability: plan.probabilities.as_ref().and_then(|p| p.get(agent).copied()),
+            cost,
+        });
+    }
+    response.largest_cost = largest.unwrap_or(0.0);
+    response.unassigned_goals.extend((0..g as u32).filter(|&goal| free[goal as usize]));
+    response.agents_without_goal =
+        reasons(&response.unassigned_agents, &problem.agent_ids, &plan.hopeless.agents, n > g);
+    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, &plan.hopeless.goals, g > n);
+    let left = |(now, then): (&u32, &u32)| *then != UNASSIGNED && now != then;
+    response.switches = plan.goal_of.iter().zip(&problem.current).filter(|pair| left(*pair)).count() as u32;
+    response
+}
+
+/// cost / exact − 1, where that means anything.
+pub(crate) fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
+    let exact = exact?;
+    if exact > 0.0 {
+        // The sums are rounded in different orders.
+        return Some((cost / exact - 1.0).max(0.0));
+    }
+    (cost <= exact).then_some(0.0)
+}
+
+fn name(ids: &[String], index: usize) -> String {
+    ids.get(index).cloned().unwrap_or_default()
+}
+
+fn reasons(left: &[u32], ids: &[String], hopeless: &[u32], outnumbered: bool) -> Vec<v1::Unassigned> {
+    let reason = |index: &u32| match hopeless.binary_search(index) {
+        Ok(_) => v1::UnassignedReason::Forbidden,
+        Err(_) if outnumbered => v1::UnassignedReason::Outnumbered,
+        Err(_) => v1::UnassignedReason::Conflict,
+    };
+    left.iter()
+        .map(|index| v1::Unassigned { index: *index, id: name(ids, *index as usize), reason: reason(index).into() })
+        .collect()
+}

@@ -1,0 +1,566 @@
+//! A mission: a team that stays. Its agents and goals appear, move, fail, finish and go; with every change it is planned
+//! again, and what changed is told with the reason.
+
+use crate::engine::Plan;
+use crate::problem::{LONGEST_ID, Problem, finite_cost, scheduler, switching_cost};
+use crate::{DispatchError, UNASSIGNED, answer};
+use magex_core::ids::Mode;
+use magex_proto::convert::ConvertError;
+use magex_proto::goals::SchedulerKind;
+use magex_proto::v1;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+/// Longest text for people, bytes.
+const LONGEST_TITLE: usize = 256;
+/// Names of missions that are training episodes begin with this.
+pub const TRAINING_PREFIX: &str = "training.";
+
+/// Longest life of a mission without an update, and most members of a side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MissionLimits {
+    /// Agents, and goals, of one mission.
+    pub members: usize,
+    /// Milliseconds.
+    pub lifetime_ms: i64,
+}
+
+/// A plan, and who made it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Planned {
+    /// The plan.
+    pub plan: Plan,
+    /// Why something else than the scheduler asked for answered; empty otherwise.
+    pub fallback_reason: String,
+    /// Weights that answered: version, SHA-256, run.
+    pub weights: Option<(u32, String, String)>,
+}
+
+/// Solves a problem with whatever is there.
+pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, DispatchError> + 'a;
+
+/// Agent, goal.
+type Names = (String, String);
+
+/// A mission and the assignment in force.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mission {
+    /// What clients see.
+    pub assignment: v1::Assignment,
+    forbidden: BTreeSet<Names>,
+    overrides: BTreeMap<Names, f64>,
+    lifetime_ms: i64,
+}
+
+/// What is kept on disk. Fields are only ever added.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Record {
+    #[prost(message, optional, tag = "1")]
+    assignment: Option<v1::Assignment>,
+    #[prost(message, repeated, tag = "2")]
+    forbidden: Vec<v1::PairRef>,
+    #[prost(message, repeated, tag = "3")]
+    overrides: Vec<v1::PairCost>,
+    #[prost(int64, tag = "4")]
+    lifetime_ms: i64,
+}
+
+impl Mission {
+    /// A new mission, planned. `drawn_id` is its name if the request brings none; `now` is milliseconds since 1970.
+    ///
+    /// # Errors
+    /// The first field that makes no sense.
+    pub fn create(
+        request: v1::CreateMissionRequest,
+        owner: &str,
+        drawn_id: &str,
+        now: i64,
+        limits: &MissionLimits,
+        planner: &Planner<'_>,
+    ) -> Result<Self, DispatchError> {
+        let id = if request.mission_id.is_empty() { drawn_id.to_owned() } else { request.mission_id };
+        check_id(&id)?;
+        if request.title.len() > LONGEST_TITLE {
+            let problem = format!("{} bytes are more than {LONGEST_TITLE}", request.title.len());
+            return Err(DispatchError::invalid("title", problem));
+        }
+        let kind = sticky_scheduler(request.scheduler)?.unwrap_or(SchedulerKind::Exact);
+        let mut mission = Self {
+            assignment: v1::Assignment {
+                mission_id: id,
+                title: request.title,
+                source: v1::MissionSource::Client.into(),
+                owner: owner.to_owned(),
+                scheduler: v1::SchedulerKind::from(kind).into(),
+                switching_cost: switching_cost(request.switching_cost)?,
+                created_ms: now,
+                ..Default::default()
+            },
+            forbidden: BTreeSet::new(),
+            overrides: BTreeMap::new(),
+            lifetime_ms: lifetime(request.lifetime_seconds, limits)?,
+        };
+        mission.upsert(request.agents, request.goals, limits)?;
+        mission.forbid("forbidden", &request.forbidden)?;
+        mission.price("cost_overrides", &request.cost_overrides)?;
+        mission.check_size(limits)?;
+        mission.plan(&Departed::default(), now, planner)?;
+        Ok(mission)
+    }
+
+    /// The mission after an update, planned; this one stays as it is.
+    ///
+    /// # Errors
+    /// The first field that makes no sense.
+    pub fn update(
+        &self,
+        request: v1::UpdateMissionRequest,
+        now: i64,
+        limits: &MissionLimits,
+        planner: &Planner<'_>,
+    ) -> Result<Self, DispatchError> {
+        let mut next = self.clone();
+        let before = Departed { agents: Vec::new(), goals: Vec::new() };
+        let departed = next.remove(&request.remove_agents, &request.remove_goals, before)?;
+        next.upsert(request.agents, request.goals, limits)?;
+        next.forbid("forbid", &request.forbid)?;
+        for (k, pair) in request.allow.iter().enumerate() {
+            let names = next.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
+            next.forbidden.remove(&names);
+        }
+        next.price("cost_overrides", &request.cost_overrides)?;
+        for (k, pair) in request.clear_cost_overrides.iter().enumerate() {
+            let names = next.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
+            next.overrides.remove(&names);
+        }
+        if let Some(cost) = request.switching_cost {
+            next.assignment.switching_cost = switching_cost(cost)?;
+        }
+        if let Some(kind) = sticky_scheduler(request.scheduler)? {
+            next.assignment.scheduler = v1::SchedulerKind::from(kind).into();
+        }
+        next.check_size(limits)?;
+        next.plan(&departed, now, planner)?;
+        Ok(next)
+    }
+
+    /// Its name.
+    pub fn id(&self) -> &str {
+        &self.assignment.mission_id
+    }
+
+    /// What is kept on disk.
+    pub fn encode(&self) -> Vec<u8> {
+        let pair = |(agent, goal): &Names| v1::PairRef {
+            agent_id: agent.clone(),
+            goal_id: goal.clone(),
+            ..Default::default()
+        };
+        let record = Record {
+            assignment: Some(self.assignment.clone()),
+            forbidden: self.forbidden.iter().map(pair).collect(),
+            overrides: self
+                .overrides
+                .iter()
+                .map(|(names, &cost)| v1::PairCost { pair: Some(pair(names)), cost })
+                .collect(),
+            lifetime_ms: self.lifetime_ms,
+        };
+        prost::Message::encode_to_vec(&record)
+    }
+
+    /// What was kept on disk.
+    ///
+    /// # Errors
+    /// Bytes that are not such a record.
+    pub fn decode(bytes: &[u8]) -> Result<Self, ConvertError> {
+        let record: Record =
+            prost::Message::decode(bytes).map_err(|error| ConvertError::new("mission", error.to_string()))?;
+        let names = |pair: v1::PairRef| (pair.agent_id, pair.goal_id);
+        let overrides = record.overrides.into_iter();
+        Ok(Self {
+            assignment: record.assignment.ok_or_else(|| ConvertError::missing("mission"))?,
+            forbidden: record.forbidden.into_iter().map(names).collect(),
+            overrides: overrides.filter_map(|item| Some((names(item.pair?), item.cost))).collect(),
+            lifetime_ms: record.lifetime_ms,
+        })
+    }
+
+    fn upsert(
+        &mut self,
+        agents: Vec<v1::Member>,
+        goals: Vec<v1::Member>,
+        limits: &MissionLimits,
+    ) -> Result<(), DispatchError> {
+        let first = |members: &[v1::Member]| members.iter().map(|member| member.position.len()).find(|&len| len > 0);
+        let a = &mut self.assignment;
+        let dims = first(&a.agents).or(first(&a.goals)).or(first(&agents)).or(first(&goals)).unwrap_or(2);
+        merge("agents", &mut a.agents, agents, dims, limits)?;
+        merge("goals", &mut a.goals, goals, dims, limits)?;
+        Ok(())
+    }
+
+    fn remove(
+        &mut self,
+        agents: &[String],
+        goals: &[String],
+        mut departed: Departed,
+    ) -> Result<Departed, DispatchError> {
+        let a = &mut self.assignment;
+        for (field, members, gone, list) in [
+            ("remove_agents", &mut a.agents, agents, &mut departed.agents),
+            ("remove_goals", &mut a.goals, goals, &mut departed.goals),
+        ] {
+            for (k, id) in gone.iter().enumerate() {
+                let Some(place) = members.iter().position(|member| member.id == *id) else {
+                    return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
+                };
+                members.remove(place);
+                list.push(id.clone());
+            }
+        }
+        self.forbidden.retain(|(agent, goal)| !agents.contains(agent) && !goals.contains(goal));
+        self.overrides.retain(|(agent, goal), _| !agents.contains(agent) && !goals.contains(goal));
+        Ok(departed)
+    }
+
+    fn forbid(&mut self, field: &str, pairs: &[v1::PairRef]) -> Result<(), DispatchError> {
+        for (k, pair) in pairs.iter().enumerate() {
+            let names = self.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
+            self.forbidden.insert(names);
+        }
+        Ok(())
+    }
+
+    fn price(&mut self, field: &str, items: &[v1::PairCost]) -> Result<(), DispatchError> {
+        for (k, item) in items.iter().enumerate() {
+            let path = format!("{field}[{k}]");
+            let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{path}.pair")))?;
+            let names = self.names(pair).map_err(|e| e.within(&format!("{path}.pair")))?;
+            self.overrides.insert(names, finite_cost(item.cost, || format!("{path}.cost"))?);
+        }
+        Ok(())
+    }
+
+    /// A mission's members come and go: only names mean anything.
+    fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
+        let known = |field: &str, members: &[v1::Member], id: &str| match members.iter().any(|m| m.id == id) {
+            true => Ok(()),
+            false if id.is_empty() => Err(ConvertError::new(field, "missing; missions name pairs by id, not by index")),
+            false => Err(ConvertError::new(field, "no member has this name")),
+        };
+        known("agent_id", &self.assignment.agents, &pair.agent_id)?;
+        known("goal_id", &self.assignment.goals, &pair.goal_id)?;
+        Ok((pair.agent_id.clone(), pair.goal_id.clone()))
+    }
+
+    fn check_size(&self, limits: &MissionLimits) -> Result<(), DispatchError> {
+        let most = 10 * limits.members;
+        for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
+            if count > most {
+                return Err(DispatchError::invalid(field, format!("{count} pairs are more than {most}")));
+            }
+        }
+        Ok(())
+    }
+
+    /// The members that take part, as a problem; `None` if a side is empty. With the places of its rows and columns.
+    fn problem(&self) -> Option<(Problem, Vec<usize>, Vec<usize>)> {
+        let a = &self.assignment;
+        let active = |members: &[v1::Member]| -> Vec<usize> {
+            (0..members.len()).filter(|&k| members[k].state() == v1::MemberState::Active).collect()
+        };
+        let (agents, goals) = (active(&a.agents), active(&a.goals));
+        if agents.is_empty() || goals.is_empty() {
+            return None;
+        }
+        let points = |members: &[v1::Member], places: &[usize]| -> Vec<f32> {
+            places.iter().flat_map(|&k| members[k].position.iter().copied()).collect()
+        };
+        let rows: HashMap<&str, u32> = (0u32..).zip(&agents).map(|(row, &k)| (a.agents[k].id.as_str(), row)).collect();
+        let cols: HashMap<&str, u32> = (0u32..).zip(&goals).map(|(col, &k)| (a.goals[k].id.as_str(), col)).collect();
+        let find = |agent: &str, goal: &str| Some((*rows.get(agent)?, *cols.get(goal)?));
+        let mut current = vec![UNASSIGNED; agents.len()];
+        for (row, col) in a.pairs.iter().filter_map(|pair| find(&pair.agent_id, &pair.goal_id)) {
+            current[row as usize] = col;
+        }
+        let problem = Problem {
+            agent_count: agents.len(),
+            goal_count: goals.len(),
+            dims: a.agents[agents[0]].position.len(),
+            agents: points(&a.agents, &agents),
+            goals: points(&a.goals, &goals),
+            agent_ids: Vec::new(),
+            goal_ids: Vec::new(),
+            matrix: None,
+            overrides: self
+                .overrides
+                .iter()
+                .filter_map(|((agent, goal), &cost)| find(agent, goal).map(|(row, col)| (row, col, cost)))
+                .collect(),
+            forbidden: self.forbidden.iter().filter_map(|(agent, goal)| find(agent, goal)).collect(),
+            current,
+            switching_cost: a.switching_cost,
+            scheduler: a.scheduler().into(),
+            mode: Mode::Greedy,
+            seed: a.revision,
+            deadline: None,
+        };
+        Some((problem, agents, goals))
+    }
+
+    fn plan(&mut self, departed: &Departed, now: i64, planner: &Planner<'_>) -> Result<(), DispatchError> {
+        let before = std::mem::take(&mut self.assignment.pairs);
+        // The problem looks at the pairs in force.
+        self.assignment.pairs.clone_from(&before);
+        let solved = match self.problem() {
+            Some((problem, agents, goals)) => {
+                let planned = planner(&problem)?;
+                Some((problem, planned, agents, goals))
+            }
+            None => None,
+        };
+        let a = &mut self.assignment;
+        a.revision += 1;
+        a.updated_ms = now;
+        a.expires_ms = now.saturating_add(self.lifetime_ms);
+        (a.pairs, a.cost, a.largest_cost) = (Vec::new(), 0.0, 0.0);
+        (a.exact_cost, a.gap, a.saving) = (Some(0.0), Some(0.0), None);
+        a.answered_by = a.scheduler;
+        (a.fallback_reason, a.version, a.sha256, a.run_id) = Default::default();
+        let (mut idle_agents, mut idle_goals) = (BTreeMap::new(), BTreeMap::new());
+        if let Some((problem, planned, agents, goals)) = &solved {
+            let response = answer::write(problem, &planned.plan);
+            (a.cost, a.largest_cost) = (response.cost, response.largest_cost);
+            (a.exact_cost, a.gap) = (response.exact_cost, response.gap);
+            a.answered_by = response.scheduler;
+            a.fallback_reason.clone_from(&planned.fallback_reason);
+            if let Some((version, sha256, run)) = planned.weights.clone() {
+                (a.version, a.sha256, a.run_id) = (version, sha256, run);
+            }
+            for mut pair in response.pairs {
+                let (agent, goal) = (agents[pair.agent_index as usize], goals[pair.goal_index as usize]);
+                (pair.agent_index, pair.goal_index) = (agent as u32, goal as u32);
+                (pair.agent_id, pair.goal_id) = (a.agents[agent].id.clone(), a.goals[goal].id.clone());
+                a.pairs.push(pair);
+            }
+            idle_agents = response.agents_without_goal.iter().map(|u| (agents[u.index as usize], u.reason)).collect();
+            idle_goals = response.goals_without_agent.iter().map(|u| (goals[u.index as usize], u.reason)).collect();
+        }
+        let paired = |side: fn(&v1::Pair) -> u32, pairs: &[v1::Pair]| -> BTreeSet<usize> {
+            pairs.iter().map(|pair| side(pair) as usize).collect()
+        };
+        a.agents_without_goal = idle(&a.agents, &paired(|p| p.agent_index, &a.pairs), &idle_agents);
+        a.goals_without_agent = idle(&a.goals, &paired(|p| p.goal_index, &a.pairs), &idle_goals);
+        self.explain(&before, departed);
+        Ok(())
+    }
+
+    /// Cost of a pair as things are now; `None` if it is not possible.
+    fn cost_of(&self, agent: &v1::Member, goal: &v1::Member) -> Option<f64> {
+        let names = (agent.id.clone(), goal.id.clone());
+        let active = |member: &v1::Member| member.state() == v1::MemberState::Active;
+        if !active(agent) || !active(goal) || self.forbidden.contains(&names) {
+            return None;
+        }
+        let square = |(x, y): (&f32, &f32)| (f64::from(*x) - f64::from(*y)) * (f64::from(*x) - f64::from(*y));
+        let distance = || agent.position.iter().zip(&goal.position).map(square).sum::<f64>().sqrt();
+        Some(self.overrides.get(&names).copied().unwrap_or_else(distance))
+    }
+
+    /// Fills in what changed against `before`, and why.
+    fn explain(&mut self, before: &[v1::Pair], departed: &Departed) {
+        let a = &self.assignment;
+        let member = |members: &[v1::Member]| -> HashMap<String, v1::Member> {
+            members.iter().map(|m| (m.id.clone(), m.clone())).collect()
+        };
+        let (agents, goals) = (member(&a.agents), member(&a.goals));
+        let cost = |agent: &str, goal: &str| self.cost_of(agents.get(agent)?, goals.get(goal)?);
+        let old: BTreeMap<&str, &str> = before.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
+        let new: BTreeMap<&str, &str> = a.pairs.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
+        let kept: Option<f64> = old.iter().map(|(agent, goal)| cost(agent, goal)).sum();
+        let saving = kept.filter(|_| old.len() == new.len() && !old.is_empty()).map(|kept| kept - a.cost);
+        let everybody: BTreeSet<&str> = old.keys().chain(new.keys()).copied().collect();
+        let mut changes = Vec::new();
+        for agent in everybody {
+            let (from, to) = (old.get(agent).copied(), new.get(agent).copied());
+            if from == to {
+                continue;
+            }
+            let state = |members: &HashMap<String, v1::Member>, id: &str| members.get(id).map(v1::Member::state);
+            let reason = match from {
+                None => v1::ChangeReason::Assigned,
+                Some(goal) => {
+                    match (state(&agents, agent), state(&goals, goal), departed.goals.iter().any(|id| id == goal)) {
+                        (None, ..) => v1::ChangeReason::AgentRemoved,
+                        (Some(v1::MemberState::Failed), ..) => v1::ChangeReason::AgentFailed,
+                        (Some(v1::MemberState::Finished), ..) => v1::ChangeReason::AgentFinished,
+                        (_, None, _) | (_, _, true) => v1::ChangeReason::GoalRemoved,
+                        (_, Some(v1::MemberState::Failed), _) => v1::ChangeReason::GoalFailed,
+                        (_, Some(v1::MemberState::Finished), _) => v1::ChangeReason::GoalFinished,
+                        _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
+                            v1::ChangeReason::PairForbidden
+                        }
+                        _ if to.is_none() => v1::ChangeReason::Displaced,
+                        _ => v1::ChangeReason::Switched,
+                    }
+                }
+            };
+            let reason = match departed.agents.iter().any(|id| id == agent) && from.is_some() {
+                true => v1::ChangeReason::AgentRemoved,
+                false => reason,
+            };
+            let gain = from.zip(to).and_then(|(from, to)| Some(cost(agent, from)? - cost(agent, to)?));
+            changes.push(v1::Change {
+                agent_id: agent.to_owned(),
+                from_goal_id: from.unwrap_or_default().to_owned(),
+                to_goal_id: to.unwrap_or_default().to_owned(),
+                reason: reason.into(),
+                gain,
+                explanation: sentence(reason, agent, from, to, saving, a.switching_cost),
+            });
+        }
+        (self.assignment.changes, self.assignment.saving) = (changes, saving);
+    }
+}
+
+/// Members that an update removed.
+#[derive(Debug, Default)]
+struct Departed {
+    agents: Vec<String>,
+    goals: Vec<String>,
+}
+
+fn sentence(
+    reason: v1::ChangeReason,
+    agent: &str,
+    from: Option<&str>,
+    to: Option<&str>,
+    saving: Option<f64>,
+    switching_cost: f64,
+) -> String {
+    let (from, then) =
+        (from.unwrap_or_default(), to.map_or_else(|| "no goal is left for it".into(), |to| format!("{to} is next")));
+    match reason {
+        v1::ChangeReason::Assigned => format!("{agent} had no goal and takes {}", to.unwrap_or_default()),
+        v1::ChangeReason::Switched => match saving {
+            Some(saving) => format!(
+                "{agent} leaves {from} for {}: the team saves {saving:.4}, more than the switching cost of {switching_cost} each",
+                to.unwrap_or_default()
+            ),
+            None => format!(
+                "{agent} leaves {from} for {}: the team as it is now is served better, by more than the switching cost of {switching_cost} each",
+                to.unwrap_or_default()
+            ),
+        },
+        v1::ChangeReason::AgentFailed => format!("{agent} failed and gives up {from}"),
+        v1::ChangeReason::AgentFinished => format!("{agent} has finished and gives up {from}"),
+        v1::ChangeReason::AgentRemoved => format!("{agent} was removed and gives up {from}"),
+        v1::ChangeReason::GoalFailed => format!("{from} failed; {then}"),
+        v1::ChangeReason::GoalFinished => format!("{from} is finished; {then}"),
+        v1::ChangeReason::GoalRemoved => format!("{from} was removed; {then}"),
+        v1::ChangeReason::PairForbidden => format!("{agent} must not go to {from} any more; {then}"),
+        v1::ChangeReason::Displaced => format!("{from} serves the team better with another agent; {then}"),
+        v1::ChangeReason::Unspecified => String::new(),
+    }
+}
+
+/// Members without a partner: those that do not take part, and those that the plan left over. Where a whole side is
+/// missing, the other outnumbers it.
+fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usize, i32>) -> Vec<v1::Unassigned> {
+    let without = members.iter().enumerate().filter(|(k, _)| !paired.contains(k));
+    without
+        .map(|(k, member)| {
+            let reason = match member.state() {
+                v1::MemberState::Active => reasons.get(&k).copied().unwrap_or(v1::UnassignedReason::Outnumbered.into()),
+                _ => v1::UnassignedReason::Inactive.into(),
+            };
+            v1::Unassigned { index: k as u32, id: member.id.clone(), reason }
+        })
+        .collect()
+}
+
+/// Adds new members, and changes those that are there.
+fn merge(
+    field: &str,
+    members: &mut Vec<v1::Member>,
+    updates: Vec<v1::Member>,
+    dims: usize,
+    limits: &MissionLimits,
+) -> Result<(), DispatchError> {
+    let mut places: HashMap<String, usize> = members.iter().enumerate().map(|(k, m)| (m.id.clone(), k)).collect();
+    let mut seen = BTreeSet::new();
+    for (k, update) in updates.into_iter().enumerate() {
+        let wrong = |part: &str, problem: String| Err(DispatchError::invalid(format!("{field}[{k}].{part}"), problem));
+        if update.id.is_empty() || update.id.len() > LONGEST_ID {
+            return wrong("id", format!("{} bytes; a name has 1 to {LONGEST_ID}", update.id.len()));
+        }
+        if !seen.insert(update.id.clone()) {
+            return wrong("id", "the same name occurs before".to_owned());
+        }
+        let Ok(state) = v1::MemberState::try_from(update.state) else {
+            return wrong("state", format!("{} is unknown", update.state));
+        };
+        if let Some(axis) = update.position.iter().position(|x| !x.is_finite()) {
+            return wrong(&format!("position[{axis}]"), format!("{} is not finite", update.position[axis]));
+        }
+        let known = places.get(&update.id).copied();
+        if !(known.is_some() && update.position.is_empty()) {
+            if !(2..=3).contains(&update.position.len()) {
+                return wrong("position", format!("{} coordinates are not 2 or 3", update.position.len()));
+            }
+            if update.position.len() != dims {
+                return wrong("position", format!("{} coordinates, others have {dims}", update.position.len()));
+            }
+        }
+        match known {
+            Some(place) => {
+                let member = &mut members[place];
+                if !update.position.is_empty() {
+                    member.position = update.position;
+                }
+                if state != v1::MemberState::Unspecified {
+                    member.state = state.into();
+                }
+            }
+            None => {
+                if members.len() >= limits.members {
+                    return wrong("id", format!("a mission has at most {} {field}", limits.members));
+                }
+                let state = if state == v1::MemberState::Unspecified { v1::MemberState::Active } else { state };
+                places.insert(update.id.clone(), members.len());
+                members.push(v1::Member { state: state.into(), ..update });
+            }
+        }
+    }
+    Ok(())
+}
+
+fn sticky_scheduler(value: i32) -> Result<Option<SchedulerKind>, DispatchError> {
+    let kind = scheduler("scheduler", value)?;
+    if kind == Some(SchedulerKind::Random) {
+        return Err(DispatchError::invalid(
+            "scheduler",
+            "a mission cannot be random; use exact, makespan, greedy or learned",
+        ));
+    }
+    Ok(kind)
+}
+
+fn check_id(id: &str) -> Result<(), DispatchError> {
+    let fits = id.len() <= LONGEST_ID && id.bytes().all(|b| b.is_ascii_alphanumeric() || b"._-".contains(&b));
+    if fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX) {
+        return Ok(());
+    }
+    let problem =
+        format!("a name has up to {LONGEST_ID} of A-Z a-z 0-9 . _ - and does not begin with '{TRAINING_PREFIX}'");
+    Err(DispatchError::invalid("mission_id", problem))
+}
+
+fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, DispatchError> {
+    let Some(seconds) = seconds else { return Ok(limits.lifetime_ms) };
+    let most = limits.lifetime_ms as f64 / 1e3;
+    if seconds > 0.0 && seconds <= most {
+        return Ok(((seconds * 1e3) as i64).max(1));
+    }
+    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is not above 0 and up to {most}")))
+}

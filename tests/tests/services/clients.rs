@@ -1,0 +1,232 @@
+//! Outside clients: one team, many, streams; what stands in for what, and what a stop looks like to them.
+
+use crate::sandbox::*;
+use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest};
+use magex_commander::service::CommanderConfig;
+use magex_commander::weights_file::WeightsFile;
+use magex_proto::v1;
+use magex_proto::v1::assign_stream_response::Result as StreamResult;
+use magex_runtime::{client, status};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Code;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus};
+use tonic_types::StatusExt as _;
+
+pub(crate) fn positions(coordinates: &[f32]) -> Option<v1::Positions> {
+    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
+}
+
+/// Two agents; the goal of each is nearest to the other's place in the list.
+pub(crate) fn team() -> v1::AssignRequest {
+    v1::AssignRequest {
+        agents: positions(&[0.0, 0.0, 3.0, 4.0]),
+        goals: positions(&[3.0, 4.0, 0.0, 0.5]),
+        ..Default::default()
+    }
+}
+
+fn grid(n: usize) -> Option<v1::Positions> {
+    positions(&(0..2 * n).map(|k| ((k * 7919) % 1009) as f32).collect::<Vec<_>>())
+}
+
+fn pair(agent_index: u32, goal_index: u32) -> v1::PairRef {
+    v1::PairRef { agent_index, goal_index, ..Default::default() }
+}
+
+fn goals(response: &v1::AssignResponse) -> Vec<u32> {
+    response.pairs.iter().map(|pair| pair.goal_index).collect()
+}
+
+fn field(status: &tonic::Status) -> String {
+    assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+    status.get_details_bad_request().unwrap().field_violations[0].field.clone()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_scheduler_and_every_kind_of_cost_over_the_wire() {
+    let commander = Commander::start("127.0.0.1:0", None).await;
+    let mut client = commander_client(&commander.url).await;
+    for (kind, expected) in [
+        (v1::SchedulerKind::Exact, vec![1, 0]),
+        (v1::SchedulerKind::ExactMakespan, vec![1, 0]),
+        (v1::SchedulerKind::Greedy, vec![1, 0]),
+    ] {
+        let reply = client.assign(v1::AssignRequest { scheduler: kind.into(), ..team() }).await.unwrap().into_inner();
+        assert_eq!((reply.scheduler(), goals(&reply)), (kind, expected));
+        assert_eq!((reply.largest_cost, reply.exact_cost, reply.gap), (0.5, Some(0.5), Some(0.0)));
+    }
+    let random = v1::AssignRequest { scheduler: v1::SchedulerKind::Random.into(), seed: Some(3), ..team() };
+    let (one, two) = (client.assign(random.clone()).await.unwrap(), client.assign(random).await.unwrap());
+    assert_eq!(one.into_inner().pairs, two.into_inner().pairs);
+    let exact = v1::AssignRequest { scheduler: v1::SchedulerKind::Exact.into(), ..team() };
+    let banned = v1::AssignRequest { forbidden: vec![pair(0, 1)], ..exact.clone() };
+    assert_eq!(goals(client.assign(banned).await.unwrap().get_ref()), [0, 1]);
+    let sticky = v1::AssignRequest { current: vec![pair(0, 0), pair(1, 1)], switching_cost: 5.0, ..exact.clone() };
+    let reply = client.assign(sticky.clone()).await.unwrap().into_inner();
+    assert_eq!((goals(&reply), reply.switches), (vec![0, 1], 0));
+    let reply = client.assign(v1::AssignRequest { switching_cost: 4.0, ..sticky }).await.unwrap().into_inner();
+    assert_eq!((goals(&reply), reply.switches), (vec![1, 0], 2));
+    let matrix = v1::CostMatrix { agents: 1, goals: 3, values: vec![3.0, 1.0, 2.0] };
+    let reply = client.assign(v1::AssignRequest { costs: Some(matrix), ..Default::default() }).await.unwrap();
+    let reply = reply.into_inner();
+    assert_eq!((goals(&reply), reply.cost, reply.unassigned_goals.clone()), (vec![1], 1.0, vec![0, 2]));
+    assert_eq!(reply.goals_without_agent[0].reason(), v1::UnassignedReason::Outnumbered);
+    assert_eq!(reply.fallback_reason, "the learned scheduler knows positions, not costs");
+    commander.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_teams_and_streams_of_teams() {
+    let commander = Commander::start("127.0.0.1:0", None).await;
+    let mut client = commander_client(&commander.url).await;
+    let wrong = v1::AssignRequest { goals: positions(&[1.0, f32::NAN]), ..team() };
+    let teams = vec![team(), wrong.clone()];
+    let status = client.assign_many(v1::AssignManyRequest { teams }).await.unwrap_err();
+    assert_eq!(field(&status), "teams[1].goals.coordinates[1]");
+    assert_eq!(field(&client.assign_many(v1::AssignManyRequest::default()).await.unwrap_err()), "teams");
+    let request = v1::AssignManyRequest { teams: vec![team(); 3] };
+    assert_eq!(client.assign_many(request).await.unwrap().into_inner().answers.len(), 3);
+
+    let (sender, receiver) = tokio::sync::mpsc::channel(4);
+    let mut answers = client.assign_stream(ReceiverStream::new(receiver)).await.unwrap().into_inner();
+    for (sequence, team) in [(7, Some(team())), (8, Some(wrong)), (9, None), (10, Some(team()))] {
+        sender.send(v1::AssignStreamRequest { sequence, team }).await.unwrap();
+    }
+    let mut seen = Vec::new();
+    for _ in 0..4 {
+        let answer = within(answers.message()).await.unwrap().unwrap();
+        seen.push((
+            answer.sequence,
+            match answer.result.unwrap() {
+                StreamResult::Answer(reply) => format!("{:?}", goals(&reply)),
+                StreamResult::Problem(problem) => {
+                    assert_eq!(problem.code, Code::InvalidArgument as u32);
+                    problem.fields[0].field.clone()
+                }
+            },
+        ));
+    }
+    let text: Vec<(u64, &str)> = seen.iter().map(|(k, text)| (*k, text.as_str())).collect();
+    assert_eq!(text, [(7, "[1, 0]"), (8, "team.goals.coordinates[1]"), (9, "team"), (10, "[1, 0]")]);
+    // The service drains: the stream ends and says why.
+    commander.shutdown.cancel();
+    let status = within(answers.message()).await.unwrap_err();
+    assert_eq!((status.code(), status.message()), (Code::Unavailable, "the service is stopping"));
+    commander.stop().await;
+}
+
+/// Thinks for 200 ms.
+struct SlowScheduler;
+
+impl Scheduler for SlowScheduler {
+    fn assign_batch(&self, _: &GoalRequest) -> Result<GoalReply, AssignError> {
+        Err(AssignError::Unsupported("not for actors".into()))
+    }
+
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
+        std::thread::sleep(Duration::from_millis(200));
+        let goals = (0..request.agent_count as u32).map(Some).collect();
+        Ok(TeamReply { goals, probabilities: None })
+    }
+}
+
+fn load_slow(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+    Ok(Arc::new(SlowScheduler))
+}
+
+/// Dies.
+struct BrokenScheduler;
+
+impl Scheduler for BrokenScheduler {
+    fn assign_batch(&self, _: &GoalRequest) -> Result<GoalReply, AssignError> {
+        panic!("broken")
+    }
+
+    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, AssignError> {
+        panic!("broken")
+    }
+}
+
+fn load_broken(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+    Ok(Arc::new(BrokenScheduler))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
+    let folder = run_folder(b"weights");
+    let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
+    let config = CommanderConfig { weights, ..CommanderConfig::default() };
+    let commander = Commander::start_with("127.0.0.1:0", config.clone(), load_slow).await;
+    let mut client = commander_client(&commander.url).await;
+    for n in [2, 100] {
+        let asked = v1::AssignRequest { agents: grid(n), goals: grid(n), ..Default::default() };
+        let reply = client.assign(asked.clone()).await.unwrap().into_inner();
+        assert_eq!((reply.scheduler(), reply.version), (v1::SchedulerKind::Learned, 0));
+        assert_eq!(reply.run_id, folder.path().file_name().unwrap().to_str().unwrap());
+        for seconds in [0.015, 0.1] {
+            let hurried = v1::AssignRequest { deadline_seconds: Some(seconds), ..asked.clone() };
+            let start = Instant::now();
+            let reply = client.assign(hurried).await.unwrap().into_inner();
+            assert_eq!(reply.scheduler(), v1::SchedulerKind::Exact);
+            assert!(reply.fallback_reason.starts_with("the model took longer than"), "{}", reply.fallback_reason);
+            assert!(start.elapsed() < Duration::from_millis(190), "{:?}", start.elapsed());
+        }
+    }
+    commander.stop().await;
+
+    let commander = Commander::start_with("127.0.0.1:0", config, load_broken).await;
+    let mut client = commander_client(&commander.url).await;
+    let reply = client.assign(team()).await.unwrap().into_inner();
+    // Where a backtrace is written it is late as well.
+    assert!(reply.scheduler() == v1::SchedulerKind::Exact && reply.fallback_reason.starts_with("the model "));
+    commander.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_deadline_ends_the_work_and_the_next_caller_does_not_notice() {
+    let commander = Commander::start("127.0.0.1:0", None).await;
+    let mut client = commander_client(&commander.url).await.max_encoding_message_size(64 << 20);
+    // Product costs make the exact solver's paths as long as they get.
+    let n = 1200u32;
+    let values = (0..n * n).map(|k| f64::from((k / n + 1) * (k % n + 1))).collect();
+    let costs = Some(v1::CostMatrix { agents: n, goals: n, values });
+    let scheduler = v1::SchedulerKind::Exact.into();
+    let hard = v1::AssignRequest { costs, scheduler, deadline_seconds: Some(0.05), ..Default::default() };
+    let start = Instant::now();
+    let status = client.assign(hard).await.unwrap_err();
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+    assert!(start.elapsed() < Duration::from_secs(20));
+    let reply = within(client.assign(v1::AssignRequest { scheduler, ..team() })).await.unwrap();
+    assert_eq!(goals(reply.get_ref()), [1, 0]);
+    commander.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_service_that_drains_says_so_and_finishes_what_it_has_begun() {
+    let folder = run_folder(b"weights");
+    let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
+    let config = CommanderConfig { weights, drain: Duration::from_millis(800), ..CommanderConfig::default() };
+    let commander = Commander::start_with("127.0.0.1:0", config, load_slow).await;
+    let mut client = commander_client(&commander.url).await;
+    let mut health = HealthClient::new(client::endpoint(&commander.url).unwrap().connect().await.unwrap());
+    let mut ask = async || {
+        let request = HealthCheckRequest { service: "magex.v1.CommanderService".into() };
+        health.check(request).await.unwrap().into_inner().status()
+    };
+    within(async { while ask().await != ServingStatus::Serving {} }).await;
+    let begun = {
+        let mut client = client.clone();
+        tokio::spawn(async move { client.assign(team()).await })
+    };
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    commander.shutdown.cancel();
+    within(async { while ask().await != ServingStatus::NotServing {} }).await;
+    let refused = client.assign(team()).await.unwrap_err();
+    assert_eq!(refused.code(), Code::Unavailable);
+    assert!(status::retry_delay(&refused).is_some());
+    assert_eq!(within(begun).await.unwrap().unwrap().into_inner().scheduler(), v1::SchedulerKind::Learned);
+    commander.stop().await;
+}
