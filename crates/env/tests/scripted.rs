@@ -4,6 +4,7 @@
 // Helpers of tests; the lint's exception covers test functions only.
 #![allow(clippy::unwrap_used)]
 
+#[path = "shared/assign.rs"]
 mod assign;
 
 use assign::exact;

@@ -11,7 +11,7 @@ use magex_commander::service::CommanderConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
-use magex_core::trajectory::{EpisodeMetrics, Shape, ShardResult, Trajectory};
+use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_learner::collector::{CollectError, Collector, GrpcCollector};
 use magex_learner::ingest::Limits;
 use magex_learner::service::{LearnerHandle, RunIdentity, learner_service};
