@@ -1,13 +1,18 @@
 //! A mission: a team that stays. Its agents and goals appear, move, fail, finish and go; with every change it is planned
 //! again, and what changed is told with the reason.
 
+mod changes;
+mod members;
+
 use crate::engine::Plan;
-use crate::problem::{LONGEST_ID, Problem, finite_cost, scheduler, switching_cost};
+use crate::problem::{Problem, finite_cost, switching_cost};
 use crate::{DispatchError, UNASSIGNED, answer};
+use changes::sentence;
 use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::SchedulerKind;
 use magex_proto::v1;
+use members::{check_id, lifetime, merge, sticky_scheduler};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// Longest text for people, bytes.
@@ -430,40 +435,6 @@ struct Departed {
     goals: Vec<String>,
 }
 
-fn sentence(
-    reason: v1::ChangeReason,
-    agent: &str,
-    from: Option<&str>,
-    to: Option<&str>,
-    saving: Option<f64>,
-    switching_cost: f64,
-) -> String {
-    let (from, then) =
-        (from.unwrap_or_default(), to.map_or_else(|| "no goal is left for it".into(), |to| format!("{to} is next")));
-    match reason {
-        v1::ChangeReason::Assigned => format!("{agent} had no goal and takes {}", to.unwrap_or_default()),
-        v1::ChangeReason::Switched => match saving {
-            Some(saving) => format!(
-                "{agent} leaves {from} for {}: the team saves {saving:.4}, more than the switching cost of {switching_cost} each",
-                to.unwrap_or_default()
-            ),
-            None => format!(
-                "{agent} leaves {from} for {}: the team as it is now is served better, by more than the switching cost of {switching_cost} each",
-                to.unwrap_or_default()
-            ),
-        },
-        v1::ChangeReason::AgentFailed => format!("{agent} failed and gives up {from}"),
-        v1::ChangeReason::AgentFinished => format!("{agent} has finished and gives up {from}"),
-        v1::ChangeReason::AgentRemoved => format!("{agent} was removed and gives up {from}"),
-        v1::ChangeReason::GoalFailed => format!("{from} failed; {then}"),
-        v1::ChangeReason::GoalFinished => format!("{from} is finished; {then}"),
-        v1::ChangeReason::GoalRemoved => format!("{from} was removed; {then}"),
-        v1::ChangeReason::PairForbidden => format!("{agent} must not go to {from} any more; {then}"),
-        v1::ChangeReason::Displaced => format!("{from} serves the team better with another agent; {then}"),
-        v1::ChangeReason::Unspecified => String::new(),
-    }
-}
-
 /// Members without a partner: those that do not take part, and those that the plan left over. Where a whole side is
 /// missing, the other outnumbers it.
 fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usize, i32>) -> Vec<v1::Unassigned> {
@@ -477,90 +448,4 @@ fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usi
             v1::Unassigned { index: k as u32, id: member.id.clone(), reason }
         })
         .collect()
-}
-
-/// Adds new members, and changes those that are there.
-fn merge(
-    field: &str,
-    members: &mut Vec<v1::Member>,
-    updates: Vec<v1::Member>,
-    dims: usize,
-    limits: &MissionLimits,
-) -> Result<(), DispatchError> {
-    let mut places: HashMap<String, usize> = members.iter().enumerate().map(|(k, m)| (m.id.clone(), k)).collect();
-    let mut seen = BTreeSet::new();
-    for (k, update) in updates.into_iter().enumerate() {
-        let wrong = |part: &str, problem: String| Err(DispatchError::invalid(format!("{field}[{k}].{part}"), problem));
-        if update.id.is_empty() || update.id.len() > LONGEST_ID {
-            return wrong("id", format!("{} bytes; a name has 1 to {LONGEST_ID}", update.id.len()));
-        }
-        if !seen.insert(update.id.clone()) {
-            return wrong("id", "the same name occurs before".to_owned());
-        }
-        let Ok(state) = v1::MemberState::try_from(update.state) else {
-            return wrong("state", format!("{} is unknown", update.state));
-        };
-        if let Some(axis) = update.position.iter().position(|x| !x.is_finite()) {
-            return wrong(&format!("position[{axis}]"), format!("{} is not finite", update.position[axis]));
-        }
-        let known = places.get(&update.id).copied();
-        if !(known.is_some() && update.position.is_empty()) {
-            if !(2..=3).contains(&update.position.len()) {
-                return wrong("position", format!("{} coordinates are not 2 or 3", update.position.len()));
-            }
-            if update.position.len() != dims {
-                return wrong("position", format!("{} coordinates, others have {dims}", update.position.len()));
-            }
-        }
-        match known {
-            Some(place) => {
-                let member = &mut members[place];
-                if !update.position.is_empty() {
-                    member.position = update.position;
-                }
-                if state != v1::MemberState::Unspecified {
-                    member.state = state.into();
-                }
-            }
-            None => {
-                if members.len() >= limits.members {
-                    return wrong("id", format!("a mission has at most {} {field}", limits.members));
-                }
-                let state = if state == v1::MemberState::Unspecified { v1::MemberState::Active } else { state };
-                places.insert(update.id.clone(), members.len());
-                members.push(v1::Member { state: state.into(), ..update });
-            }
-        }
-    }
-    Ok(())
-}
-
-fn sticky_scheduler(value: i32) -> Result<Option<SchedulerKind>, DispatchError> {
-    let kind = scheduler("scheduler", value)?;
-    if kind == Some(SchedulerKind::Random) {
-        return Err(DispatchError::invalid(
-            "scheduler",
-            "a mission cannot be random; use exact, makespan, greedy or learned",
-        ));
-    }
-    Ok(kind)
-}
-
-fn check_id(id: &str) -> Result<(), DispatchError> {
-    let fits = id.len() <= LONGEST_ID && id.bytes().all(|b| b.is_ascii_alphanumeric() || b"._-".contains(&b));
-    if fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX) {
-        return Ok(());
-    }
-    let problem =
-        format!("a name has up to {LONGEST_ID} of A-Z a-z 0-9 . _ - and does not begin with '{TRAINING_PREFIX}'");
-    Err(DispatchError::invalid("mission_id", problem))
-}
-
-fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, DispatchError> {
-    let Some(seconds) = seconds else { return Ok(limits.lifetime_ms) };
-    let most = limits.lifetime_ms as f64 / 1e3;
-    if seconds > 0.0 && seconds <= most {
-        return Ok(((seconds * 1e3) as i64).max(1));
-    }
-    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is not above 0 and up to {most}")))
 }
