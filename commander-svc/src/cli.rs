@@ -68,7 +68,7 @@ pub struct CommanderArgs {
     #[arg(long, default_value_t = 100, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
     pub missions_per_client: u32,
     /// Most agents, and most goals, of one mission
-    #[arg(long, default_value_t = 1000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000), help_heading = "Limits")]
+    #[arg(long, default_value_t = 1000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=2000), help_heading = "Limits")]
     pub mission_agents: u32,
     /// Hours after its last update at which a mission is forgotten
     #[arg(long, default_value_t = 24, value_name = "H", value_parser = clap::value_parser!(u32).range(1..=8760), help_heading = "Limits")]

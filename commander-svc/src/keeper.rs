@@ -10,13 +10,13 @@ use magex_dispatch::{DispatchError, Problem};
 use magex_proto::v1;
 use magex_runtime::backoff::incarnation;
 use magex_runtime::status;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::sync::broadcast;
 use tonic::Status;
 
 /// Events that a slow watcher may fall behind before it gets everything anew.
-const BACKLOG: usize = 1024;
+const BACKLOG: usize = 64;
 /// How long planning a mission may take.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// How often an update is planned again because the mission changed meanwhile.
@@ -42,6 +42,8 @@ pub(crate) struct Keeper {
     training: Training,
     answering: Arc<Answering>,
     events: broadcast::Sender<Event>,
+    /// Held from a change until the watchers have been told: they hear of changes in their order.
+    order: Mutex<()>,
 }
 
 /// Milliseconds since 1970.
@@ -51,7 +53,8 @@ pub(crate) fn now_ms() -> i64 {
 
 impl Keeper {
     pub(crate) fn new(missions: Missions, answering: Arc<Answering>) -> Arc<Self> {
-        Arc::new(Self { missions, training: Training::default(), answering, events: broadcast::Sender::new(BACKLOG) })
+        let (training, events) = (Training::default(), broadcast::Sender::new(BACKLOG));
+        Arc::new(Self { missions, training, answering, events, order: Mutex::default() })
     }
 
     pub(crate) async fn create(
@@ -60,17 +63,16 @@ impl Keeper {
         request: v1::CreateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
         let (own, permit) = (self.clone(), self.answering.processor().await?);
-        let mission = blocking(move || {
+        blocking(move || {
             let _held = permit;
             own.missions.check_room(&caller.name).map_err(kept)?;
             let (now, each) = (now_ms(), own.missions.bounds().each);
             let drawn = format!("m-{:016x}", incarnation());
             let planner = |problem: &Problem| own.plan(problem);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(refusal)?;
-            own.missions.insert(mission).map_err(kept)
+            own.change(v1::WatchKind::Changed, || own.missions.insert(mission)).map_err(kept)
         })
-        .await?;
-        Ok(self.tell(v1::WatchKind::Changed, mission))
+        .await
     }
 
     pub(crate) async fn update(
@@ -79,7 +81,7 @@ impl Keeper {
         request: v1::UpdateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
         let (own, permit) = (self.clone(), self.answering.processor().await?);
-        let mission = blocking(move || {
+        blocking(move || {
             let _held = permit;
             let each = own.missions.bounds().each;
             let mut attempt = 0;
@@ -94,26 +96,23 @@ impl Keeper {
                 let planner = |problem: &Problem| own.plan(problem);
                 let next = before.update(request.clone(), now_ms(), &each, &planner).map_err(refusal)?;
                 attempt += 1;
-                match own.missions.replace(next, was) {
+                match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
                     // Planned for what is no longer so.
                     Err(KeepError::Changed { .. }) if request.expected_revision.is_none() && attempt < ATTEMPTS => {}
                     result => return result.map_err(kept),
                 }
             }
         })
-        .await?;
-        Ok(self.tell(v1::WatchKind::Changed, mission))
+        .await
     }
 
     pub(crate) async fn delete(self: &Arc<Self>, caller: Caller, id: String) -> Result<(), Status> {
         let own = self.clone();
-        let mission = blocking(move || {
+        blocking(move || {
             own.writable(&caller, &id)?;
-            own.missions.remove(&id).map_err(kept)
+            own.change(v1::WatchKind::Deleted, || own.missions.remove(&id)).map(drop).map_err(kept)
         })
-        .await?;
-        self.tell(v1::WatchKind::Deleted, mission);
-        Ok(())
+        .await
     }
 
     pub(crate) fn get(&self, caller: &Caller, id: &str) -> Result<v1::Assignment, Status> {
@@ -185,8 +184,14 @@ impl Keeper {
     /// Forgets missions whose time is over.
     pub(crate) async fn sweep(self: &Arc<Self>) {
         let own = self.clone();
-        match tokio::task::spawn_blocking(move || own.missions.expire(now_ms())).await {
-            Ok(Ok(old)) => old.into_iter().for_each(|mission| drop(self.tell(v1::WatchKind::Expired, mission))),
+        let sweeping = move || {
+            let _order = own.order.lock().unwrap_or_else(PoisonError::into_inner);
+            let old = own.missions.expire(now_ms())?;
+            old.into_iter().for_each(|mission| drop(own.tell(v1::WatchKind::Expired, mission)));
+            Ok::<(), KeepError>(())
+        };
+        match tokio::task::spawn_blocking(sweeping).await {
+            Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::error!(%error, "old missions cannot be forgotten"),
             Err(error) => tracing::error!(%error, "old missions cannot be forgotten"),
         }
@@ -207,6 +212,17 @@ impl Keeper {
             Some(_) => Err(status::failed_precondition(format!("'{id}' is an episode of a training run: read only"))),
             None => Err(missing(id)),
         }
+    }
+
+    /// Changes something and tells the watchers. Runs where nobody who hangs up can come in between.
+    fn change(
+        &self,
+        kind: v1::WatchKind,
+        change: impl FnOnce() -> Result<Arc<Mission>, KeepError>,
+    ) -> Result<v1::Assignment, KeepError> {
+        // A thread that died left nothing half done: the lock guards no value.
+        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+        Ok(self.tell(kind, change()?))
     }
 
     fn tell(&self, kind: v1::WatchKind, mission: Arc<Mission>) -> v1::Assignment {

@@ -11,7 +11,7 @@ use magex_proto::goals::{GoalReply, GoalRequest};
 pub fn answer(commander: &Commander, random_share: f32, request: &GoalRequest) -> Result<GoalReply, CommanderError> {
     let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     let b = request.shard.episodes as usize;
-    if n == 0 || d == 0 || request.agents.len() != b * k * n * d || request.goals.len() != b * k * g * d {
+    if n == 0 || d == 0 || k == 0 || request.agents.len() != b * k * n * d || request.goals.len() != b * k * g * d {
         return Err(CommanderError::Instance(format!(
             "agents, goals: {} and {} numbers do not make {b} times {k} teams of {n} agents and {g} goals in {d} dimensions",
             request.agents.len(),
@@ -59,4 +59,44 @@ pub fn cost(team: &Team<'_>, goals: &[u32]) -> f64 {
         }
     }
     total
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+    use magex_core::config::CommanderKind;
+    use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+    use magex_proto::goals::SchedulerKind;
+
+    #[test]
+    fn a_shard_without_agents_dimensions_or_stages_is_refused() {
+        let shard = Shard {
+            kind: ShardKind::Train,
+            iteration: Iteration(0),
+            index: 0,
+            episodes: 1,
+            first_episode: 0,
+            version: WeightsVersion(0),
+            mode: Mode::Greedy,
+            eval_set: 0,
+            record: false,
+        };
+        let scheduler = SchedulerKind::Exact;
+        let (agents, goals) = (vec![0.0, 0.0], vec![1.0, 0.0]);
+        let (stages, agent_count, goal_count, dims) = (1, 1, 1, 2);
+        let good = GoalRequest { shard, seed: 1, scheduler, stages, agent_count, goal_count, dims, agents, goals };
+        let commander = Commander::classical(CommanderKind::Exact).unwrap();
+        assert_eq!(answer(&commander, 0.0, &good).unwrap().goals, [0]);
+        let empty = GoalRequest { agents: Vec::new(), goals: Vec::new(), ..good };
+        for request in [
+            GoalRequest { stages: 0, ..empty.clone() },
+            GoalRequest { agent_count: 0, goal_count: 0, ..empty.clone() },
+            GoalRequest { dims: 0, ..empty },
+        ] {
+            let refused = answer(&commander, 0.0, &request);
+            assert!(matches!(refused, Err(CommanderError::Instance(_))), "{refused:?}");
+        }
+    }
 }

@@ -37,8 +37,11 @@ impl WeightsError {
     }
 }
 
-/// What a file looks like from outside; when it differs the file is read.
-type Stamp = Option<(SystemTime, u64)>;
+/// What both files look like from outside; when it differs they are read.
+type Stamp = [(SystemTime, u64); 2];
+
+/// SHA-256 of the weights and of the configuration.
+type Content = [String; 2];
 
 impl WeightsFile {
     /// A run folder, or a weights file with the configuration given or beside it.
@@ -68,53 +71,63 @@ impl WeightsFile {
         Ok(Self { weights, config, name })
     }
 
-    /// Reads both files and makes a model of them.
-    fn load(&self, version: u32, load_scheduler: LoadScheduler) -> Result<Model, WeightsError> {
+    /// Reads both files and makes a model of them. With what it was made of, to tell whether it is another.
+    fn load(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), WeightsError> {
         let bytes = std::fs::read(&self.weights).map_err(|error| WeightsError::new(&self.weights, error))?;
         let toml = std::fs::read_to_string(&self.config).map_err(|error| WeightsError::new(&self.config, error))?;
         let scheduler = load_scheduler(&bytes, &toml).map_err(|error| WeightsError::new(&self.weights, error))?;
         let (run_id, sha256) = (RunId(self.name.clone()), sha256_hex(&bytes));
+        let content = [sha256.clone(), sha256_hex(toml.as_bytes())];
         let key = Arc::new(WeightsKey { run_id, version: WeightsVersion(version), sha256 });
-        Ok(Model { key, scheduler: Ok(scheduler) })
+        Ok((Model { key, scheduler: Ok(scheduler) }, content))
     }
 
-    fn stamp(&self) -> Stamp {
-        let meta = std::fs::metadata(&self.weights).ok()?;
-        Some((meta.modified().ok()?, meta.len()))
+    /// `None` while one of them is not there.
+    fn stamp(&self) -> Option<Stamp> {
+        let look = |path: &Path| {
+            let meta = std::fs::metadata(path).ok()?;
+            Some((meta.modified().ok()?, meta.len()))
+        };
+        Some([look(&self.weights)?, look(&self.config)?])
     }
 
     /// Loads them once, into the store.
     pub(crate) async fn first(&self, store: &Store, load_scheduler: LoadScheduler) -> Result<Loaded, WeightsError> {
         let (own, stamp) = (self.clone(), self.stamp());
         let load = tokio::task::spawn_blocking(move || own.load(0, load_scheduler));
-        let model = load.await.map_err(|error| WeightsError::new(&self.weights, error))??;
-        let sha256 = model.key.sha256.clone();
+        let (model, content) = load.await.map_err(|error| WeightsError::new(&self.weights, error))??;
+        let sha256 = &model.key.sha256;
         tracing::info!(weights = %self.weights.display(), sha256, "a model is ready");
         store.insert(model);
-        Ok(Loaded { stamp, sha256 })
+        Ok(Loaded { stamp, content })
     }
 
-    /// Loads them again, as the next version, whenever they are replaced. What cannot be used changes nothing.
+    /// Loads them again, as the next version, whenever one is replaced. What cannot be used changes nothing, and is tried
+    /// again: the other file, or the rest of this one, may be on its way.
     pub(crate) async fn follow(self, mut loaded: Loaded, store: Arc<Store>, load_scheduler: LoadScheduler) {
-        let mut version = 0;
+        let (mut version, mut told) = (0, None);
         loop {
             tokio::time::sleep(INTERVAL).await;
             let stamp = self.stamp();
             if stamp.is_none() || stamp == loaded.stamp {
                 continue;
             }
-            loaded.stamp = stamp;
             let own = self.clone();
             let load = tokio::task::spawn_blocking(move || own.load(version + 1, load_scheduler));
             match load.await.map_err(|error| WeightsError::new(&self.weights, error)).and_then(|model| model) {
-                Ok(model) if model.key.sha256 == loaded.sha256 => {}
-                Ok(model) => {
+                Ok((_, content)) if content == loaded.content => loaded.stamp = stamp,
+                Ok((model, content)) => {
                     version += 1;
-                    loaded.sha256.clone_from(&model.key.sha256);
-                    tracing::info!(version, sha256 = loaded.sha256, "the weights were replaced");
+                    tracing::info!(version, sha256 = model.key.sha256, "the weights were replaced");
+                    loaded = Loaded { stamp, content };
                     store.insert(model);
                 }
-                Err(error) => tracing::warn!(%error, "new weights cannot be used; the old ones go on answering"),
+                // Once for each state of the files.
+                Err(error) if told != stamp => {
+                    told = stamp;
+                    tracing::warn!(%error, "new weights cannot be used; the old ones go on answering");
+                }
+                Err(_) => {}
             }
         }
     }
@@ -123,6 +136,7 @@ impl WeightsFile {
 /// What was loaded last.
 #[derive(Debug)]
 pub(crate) struct Loaded {
-    stamp: Stamp,
-    sha256: String,
+    /// What the files looked like before they were read.
+    stamp: Option<Stamp>,
+    content: Content,
 }

@@ -129,6 +129,9 @@ impl GoalRequest {
         let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
         let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
         let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
+        if stages == 0 {
+            return Err(ConvertError::new("agents", "no stage; send at least one assignment problem per episode"));
+        }
         let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
         let request =
@@ -214,6 +217,15 @@ mod tests {
         assert_eq!(GoalReply::from_message(message.clone(), &request()).unwrap(), reply);
         let other = v1::AssignBatchResponse { version: 2, ..message };
         assert!(GoalReply::from_message(other, &request()).unwrap_err().to_string().contains("version 2 answered"));
+    }
+
+    #[test]
+    fn a_request_without_a_stage_is_refused() {
+        let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
+        let empty = GoalRequest { stages: 0, agents: vec![], goals: vec![], ..request() };
+        assert!(
+            GoalRequest::from_message(empty.to_message(&key)).unwrap_err().to_string().starts_with("agents: no stage")
+        );
     }
 
     #[test]

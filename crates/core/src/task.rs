@@ -207,6 +207,7 @@ impl TaskConfig {
         if self.layout_scale == 0.0 {
             self.layout_scale = match self.name {
                 TaskName::PushBall => 0.5,
+                TaskName::Drones => 1.0,
                 _ if self.agents <= 20 => 1.5,
                 _ => 2.0,
             };
@@ -297,8 +298,8 @@ impl TaskConfig {
         if !(1..=100_000).contains(&self.horizon) {
             return Err(format!("task.horizon: {} is outside 1..=100000", self.horizon));
         }
-        if !(self.layout_scale.is_finite() && self.layout_scale > 0.0) {
-            return Err(format!("task.layout_scale: {} must be positive", self.layout_scale));
+        if !(self.layout_scale.is_finite() && (0.01..=100.0).contains(&self.layout_scale)) {
+            return Err(format!("task.layout_scale: {} is outside 0.01..=100", self.layout_scale));
         }
         self.refuse_settings_of_other_tasks()?;
         match self.name {
@@ -336,6 +337,7 @@ impl TaskConfig {
 
     /// A setting that this task does not read would look as if it did something.
     fn refuse_settings_of_other_tasks(&self) -> Result<(), String> {
+        // The unit of distance follows the side by itself.
         let reward = RewardConfig { distance_unit: self.reward.distance_unit, ..RewardConfig::default() };
         for (section, owner, untouched) in [
             ("task.reward", TaskName::SimpleSpread, self.reward == reward),

@@ -31,7 +31,7 @@ pub struct Plan {
     pub scheduler: SchedulerKind,
     /// Summed cost.
     pub cost: f64,
-    /// Least summed cost possible, if it is known and the answer has as many pairs.
+    /// Least summed cost possible, if there was time to find it and the answer has as many pairs.
     pub exact_cost: Option<f64>,
     /// `[N]` cost of each agent's pair; 0 without one.
     pub pair_costs: Vec<f64>,
@@ -202,8 +202,12 @@ impl Workspace {
         let exact_cost = match exact_cost {
             Some(exact) => Some(exact),
             None if rows * cols <= GAP_CELLS => {
-                let exact = solver.solve_allowed(costs, rows, cols, go_on).map_err(refused)?;
-                (exact.pairs().count() == pairs(&goal_of).count()).then_some(exact.cost)
+                match solver.solve_allowed(costs, rows, cols, go_on) {
+                    Ok(exact) => (exact.pairs().count() == pairs(&goal_of).count()).then_some(exact.cost),
+                    // The answer is there; how far it is from the best is not worth losing it.
+                    Err(AssignError::Interrupted) => None,
+                    Err(other) => return Err(refused(other)),
+                }
             }
             None => None,
         };

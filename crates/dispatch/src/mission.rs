@@ -12,8 +12,8 @@ use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::SchedulerKind;
 use magex_proto::v1;
-use members::{check_id, lifetime, merge, sticky_scheduler};
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use members::{Known, check_id, check_lengths, lifetime, merge, most_pairs, sticky_scheduler};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 /// Longest text for people, bytes.
 const LONGEST_TITLE: usize = 256;
@@ -88,6 +88,15 @@ impl Mission {
             let problem = format!("{} bytes are more than {LONGEST_TITLE}", request.title.len());
             return Err(DispatchError::invalid("title", problem));
         }
+        check_lengths(
+            limits,
+            &[
+                ("agents", request.agents.len()),
+                ("goals", request.goals.len()),
+                ("forbidden", request.forbidden.len()),
+                ("cost_overrides", request.cost_overrides.len()),
+            ],
+        )?;
         let kind = sticky_scheduler(request.scheduler)?.unwrap_or(SchedulerKind::Exact);
         let mut mission = Self {
             assignment: v1::Assignment {
@@ -123,18 +132,33 @@ impl Mission {
         limits: &MissionLimits,
         planner: &Planner<'_>,
     ) -> Result<Self, DispatchError> {
+        check_lengths(
+            limits,
+            &[
+                ("agents", request.agents.len()),
+                ("goals", request.goals.len()),
+                ("remove_agents", request.remove_agents.len()),
+                ("remove_goals", request.remove_goals.len()),
+                ("forbid", request.forbid.len()),
+                ("allow", request.allow.len()),
+                ("cost_overrides", request.cost_overrides.len()),
+                ("clear_cost_overrides", request.clear_cost_overrides.len()),
+            ],
+        )?;
         let mut next = self.clone();
         let before = Departed { agents: Vec::new(), goals: Vec::new() };
         let departed = next.remove(&request.remove_agents, &request.remove_goals, before)?;
         next.upsert(request.agents, request.goals, limits)?;
         next.forbid("forbid", &request.forbid)?;
+        let known = Known::of(&next.assignment);
         for (k, pair) in request.allow.iter().enumerate() {
-            let names = next.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
+            let names = known.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
             next.forbidden.remove(&names);
         }
         next.price("cost_overrides", &request.cost_overrides)?;
+        let known = Known::of(&next.assignment);
         for (k, pair) in request.clear_cost_overrides.iter().enumerate() {
-            let names = next.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
+            let names = known.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
             next.overrides.remove(&names);
         }
         if let Some(cost) = request.switching_cost {
@@ -215,51 +239,42 @@ impl Mission {
             ("remove_agents", &mut a.agents, agents, &mut departed.agents),
             ("remove_goals", &mut a.goals, goals, &mut departed.goals),
         ] {
-            for (k, id) in gone.iter().enumerate() {
-                let Some(place) = members.iter().position(|member| member.id == *id) else {
-                    return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
-                };
-                members.remove(place);
-                list.push(id.clone());
+            let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
+            if let Some(k) = gone.iter().position(|id| !left.remove(id.as_str())) {
+                return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
             }
+            let going: HashSet<&str> = gone.iter().map(String::as_str).collect();
+            members.retain(|member| !going.contains(member.id.as_str()));
+            list.extend_from_slice(gone);
         }
+        let (agents, goals): (HashSet<&String>, HashSet<&String>) = (agents.iter().collect(), goals.iter().collect());
         self.forbidden.retain(|(agent, goal)| !agents.contains(agent) && !goals.contains(goal));
         self.overrides.retain(|(agent, goal), _| !agents.contains(agent) && !goals.contains(goal));
         Ok(departed)
     }
 
     fn forbid(&mut self, field: &str, pairs: &[v1::PairRef]) -> Result<(), DispatchError> {
+        let known = Known::of(&self.assignment);
         for (k, pair) in pairs.iter().enumerate() {
-            let names = self.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
+            let names = known.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
             self.forbidden.insert(names);
         }
         Ok(())
     }
 
     fn price(&mut self, field: &str, items: &[v1::PairCost]) -> Result<(), DispatchError> {
+        let known = Known::of(&self.assignment);
         for (k, item) in items.iter().enumerate() {
             let path = format!("{field}[{k}]");
             let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{path}.pair")))?;
-            let names = self.names(pair).map_err(|e| e.within(&format!("{path}.pair")))?;
+            let names = known.names(pair).map_err(|e| e.within(&format!("{path}.pair")))?;
             self.overrides.insert(names, finite_cost(item.cost, || format!("{path}.cost"))?);
         }
         Ok(())
     }
 
-    /// A mission's members come and go: only names mean anything.
-    fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
-        let known = |field: &str, members: &[v1::Member], id: &str| match members.iter().any(|m| m.id == id) {
-            true => Ok(()),
-            false if id.is_empty() => Err(ConvertError::new(field, "missing; missions name pairs by id, not by index")),
-            false => Err(ConvertError::new(field, "no member has this name")),
-        };
-        known("agent_id", &self.assignment.agents, &pair.agent_id)?;
-        known("goal_id", &self.assignment.goals, &pair.goal_id)?;
-        Ok((pair.agent_id.clone(), pair.goal_id.clone()))
-    }
-
     fn check_size(&self, limits: &MissionLimits) -> Result<(), DispatchError> {
-        let most = 10 * limits.members;
+        let most = most_pairs(limits);
         for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
             if count > most {
                 return Err(DispatchError::invalid(field, format!("{count} pairs are more than {most}")));

@@ -163,6 +163,7 @@ fn wrong_fields_are_named() {
         |m| m.agents = (0..21).map(|k| member(&k.to_string(), &[0.0, 0.0])).collect(),
         "agents[20].id: a mission has at most 20",
     );
+    created(|m| m.forbidden = vec![pair("a", "z"); 201], "forbidden: 201 entries are more than 200");
     let mission = start(0.0);
     let updated = |request: v1::UpdateMissionRequest, words: &str| {
         let error = mission.update(request, 0, &LIMITS, &planner).unwrap_err().to_string();
@@ -170,6 +171,10 @@ fn wrong_fields_are_named() {
     };
     let wrong = v1::UpdateMissionRequest { remove_goals: vec!["z".into()], ..Default::default() };
     updated(wrong, "remove_goals[0]: no member");
+    let wrong = v1::UpdateMissionRequest { remove_agents: vec!["a".into(), "a".into()], ..Default::default() };
+    updated(wrong, "remove_agents[1]: no member");
+    let wrong = v1::UpdateMissionRequest { allow: vec![pair("a", "z"); 201], ..Default::default() };
+    updated(wrong, "allow: 201 entries are more than 200");
     let wrong = v1::UpdateMissionRequest { agents: vec![state("new", MemberState::Active)], ..Default::default() };
     updated(wrong, "agents[0].position: 0 coordinates");
 }

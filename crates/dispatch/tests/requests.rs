@@ -174,6 +174,14 @@ fn nobody_waits_for_an_answer_that_nobody_wants() {
     let problem = read(team(&coordinates, &coordinates[2..]));
     let stopped = engine::solve(&problem, SchedulerKind::Makespan, &|| false);
     assert_eq!(stopped, Err(DispatchError::Interrupted));
+    // An answer that is there stays, without its distance to the best.
+    let values = (0..144).map(|k| f64::from((k / 12 + 1) * (k % 12 + 1))).collect();
+    let costs = Some(v1::CostMatrix { agents: 12, goals: 12, values });
+    let problem = read(v1::AssignRequest { costs, ..Default::default() });
+    let greedy = engine::solve(&problem, SchedulerKind::Greedy, &|| false).unwrap();
+    assert_eq!(greedy.exact_cost, None);
+    assert_eq!(greedy.goal_of, solve(&problem, SchedulerKind::Greedy).goal_of);
+    assert!(solve(&problem, SchedulerKind::Greedy).exact_cost.is_some());
 }
 
 /// Every way to give each agent one of the goals or none, as goal_of.

@@ -7,6 +7,8 @@
 //! | `attention` | multi-head attention over all agents (ablation "-Atten") | relative | GRU |
 //! | `mlp` | one layer on the concatenated observations (ablation "-MLP"); fixed team size | relative | GRU |
 //! | `local` | sum over the k nearest neighbours | relative | none |
+//!
+//! Where a task has encounters, `magex`, `attention` and `mlp` sum over the k nearest neighbours, too (Encounter Encoder).
 
 mod local;
 mod team;

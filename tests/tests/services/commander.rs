@@ -88,7 +88,12 @@ async fn a_batch_waits_for_its_weights_and_is_told_when_they_do_not_come() {
 async fn outside_clients_get_assignments_with_and_without_a_model() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let (mut client, mut health_client) = connect(&commander).await;
-    assert_eq!(health(&mut health_client).await, ServingStatus::Serving);
+    within(async {
+        while health(&mut health_client).await != ServingStatus::Serving {
+            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+        }
+    })
+    .await;
     // The two are nearest to each other's place in the list.
     let request = v1::AssignRequest {
         agents: positions(&[0.0, 0.0, 3.0, 4.0]),

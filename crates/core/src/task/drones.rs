@@ -94,8 +94,14 @@ pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
     if task.spawn != Spawn::Uniform {
         return Err(format!("task.spawn: drones start uniform in the box, not on '{}'; use uniform", task.spawn));
     }
+    if task.layout_scale != 1.0 {
+        return Err(format!(
+            "task.layout_scale: {} has no meaning for drones, who have no layouts; remove it",
+            task.layout_scale
+        ));
+    }
     let slowest = (DroneConfig::RATE_LOOP / 2.0).ceil() as u32;
-    if d.physics_hz <= slowest || d.physics_hz > 1920 || !d.physics_hz.is_multiple_of(DroneConfig::COMMANDS_HZ) {
+    if !(120..=1920).contains(&d.physics_hz) || !d.physics_hz.is_multiple_of(DroneConfig::COMMANDS_HZ) {
         return Err(format!(
             "task.drones.physics_hz: {} must be a multiple of {} in 120..=1920; at {slowest} and less the attitude controller \
              chatters",

@@ -27,7 +27,7 @@ pub struct Observation {
     pub contact: f32,
     /// The axes that an agent sees the world along.
     pub frame: Frame,
-    /// Neighbours are seen with the time and the offset of their closest approach, by every executor.
+    /// Neighbours are seen with the time and the offset of their closest approach, by every executor but the literal one.
     pub encounters: bool,
     /// Which of an agent's extras says (by 1) that it is out of the episode: others do not see it any more.
     pub out: Option<usize>,

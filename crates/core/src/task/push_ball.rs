@@ -46,6 +46,21 @@ pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
     if !(0.0..=1.0).contains(&p.aligned) {
         return Err(format!("task.push_ball.aligned: {} is outside 0..=1", p.aligned));
     }
+    // The balls of the authors' layouts, on their longest line, in raw units apart.
+    let gap = match task.agents {
+        20 => 6.0 / 19.0,
+        50 => 12.0 / 49.0,
+        // Other sizes are scaled to fit.
+        _ => f32::INFINITY,
+    };
+    if task.spawn != Spawn::Uniform && gap / task.layout_scale < SPACING {
+        return Err(format!(
+            "task.layout_scale: {} puts the balls of the layouts {:.2} apart, closer than {SPACING}; use at most {:.2}",
+            task.layout_scale,
+            gap / task.layout_scale,
+            gap / SPACING
+        ));
+    }
     if task.spawn == Spawn::Uniform {
         // Agents keep 0.25 from balls and 0.2 from each other: together they need little more room than twice the balls.
         task.check_room("balls with as many agents", 2 * task.agents, SPACING)?;

@@ -1,11 +1,53 @@
 //! Members and settings of a mission, as requests bring them.
 
-use super::{MissionLimits, TRAINING_PREFIX};
+use super::{MissionLimits, Names, TRAINING_PREFIX};
 use crate::DispatchError;
 use crate::problem::{LONGEST_ID, scheduler};
+use magex_proto::convert::ConvertError;
 use magex_proto::goals::SchedulerKind;
 use magex_proto::v1;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap, HashSet};
+
+/// Most pairs that a mission forbids, or prices, and longest list in a request.
+pub(super) fn most_pairs(limits: &MissionLimits) -> usize {
+    limits.members.saturating_mul(10)
+}
+
+/// Refuses lists that nobody needs before anything goes through them.
+pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), DispatchError> {
+    let most = most_pairs(limits);
+    match lists.iter().find(|(_, count)| *count > most) {
+        Some((field, count)) => {
+            Err(DispatchError::invalid(*field, format!("{count} entries are more than {most}; send fewer at a time")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// The names of a mission's members.
+pub(super) struct Known<'a> {
+    agents: HashSet<&'a str>,
+    goals: HashSet<&'a str>,
+}
+
+impl<'a> Known<'a> {
+    pub(super) fn of(assignment: &'a v1::Assignment) -> Self {
+        let ids = |members: &'a [v1::Member]| members.iter().map(|member| member.id.as_str()).collect();
+        Self { agents: ids(&assignment.agents), goals: ids(&assignment.goals) }
+    }
+
+    /// A mission's members come and go: only names mean anything.
+    pub(super) fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
+        let known = |field: &str, members: &HashSet<&str>, id: &str| match members.contains(id) {
+            true => Ok(()),
+            false if id.is_empty() => Err(ConvertError::new(field, "missing; missions name pairs by id, not by index")),
+            false => Err(ConvertError::new(field, "no member has this name")),
+        };
+        known("agent_id", &self.agents, &pair.agent_id)?;
+        known("goal_id", &self.goals, &pair.goal_id)?;
+        Ok((pair.agent_id.clone(), pair.goal_id.clone()))
+    }
+}
 
 /// Adds new members, and changes those that are there.
 pub(super) fn merge(

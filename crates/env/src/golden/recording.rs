@@ -6,7 +6,7 @@ use super::reader::Field;
 /// Most bodies and steps a recording may have: far beyond any, small enough that sizes cannot overflow.
 const MOST: usize = 1_000_000;
 /// Most agents, and balls, so that a pair of them can be named by 32 bits.
-const MOST_AGENTS: usize = 1 << 15;
+const MOST_AGENTS: usize = 1 << 11;
 
 /// An agent, a ball or a landmark.
 #[derive(Debug, Clone, Copy, PartialEq)]

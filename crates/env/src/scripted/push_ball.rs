@@ -29,7 +29,7 @@ pub fn scripted_push_ball(view: &View<'_>, agents: usize, actions: &mut [u8]) ->
     let n = agents;
     let episodes = view.goals.len() / (2 * n).max(1);
     let states = actions.len() / n.max(1);
-    check_len("goals", view.goals.len(), 2 * n * episodes)?;
+    check_len("goals", view.goals.len(), 2 * n * episodes.max(usize::from(states > 0)))?;
     check_len("landmarks", view.landmarks.len(), 2 * n * episodes)?;
     check_len("actions", actions.len(), n * states.next_multiple_of(episodes.max(1)))?;
     check_len("positions", view.positions.len(), 4 * n * states)?;

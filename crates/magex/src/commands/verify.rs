@@ -13,13 +13,15 @@ Examples:
   magex verify recordings/mpe-n50.json       one file
   magex verify DIR --json
 
-Recordings of the original simulator (format mpe-golden-1) are replayed step by step; recordings of
-assignment problems are solved. The worst difference per file is printed beside the largest one that
-passes. Other JSON files are skipped.
+Recordings of the original particle simulator (mpe-golden-1: Simple Spread and Push Ball) and of the original
+drone simulator (drone-golden-1) are replayed step by step, the drones by the exact model and by the task's
+rigid-body engine; calls of its controller (drone-controller-golden-1) and its forces (drone-forces-golden-1)
+are recomputed; assignment problems (assignment-golden-1) are solved. The worst difference per file is printed
+beside the largest one that passes, or beside the reason why there is none. Other JSON files are skipped.
 
 Exit codes: 0 everything agrees, 1 something does not or nothing could be checked, 64 no such folder";
 
-/// Check the simulator and the solver against recordings.
+/// Check simulators, controller and solver against recordings.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct VerifyArgs {
@@ -48,7 +50,11 @@ fn value(file: &FileReport) -> Value {
         Outcome::Fails(reasons) => ("fails", reasons.clone()),
         Outcome::Skipped(reason) => ("skipped", vec![reason.clone()]),
     };
-    let checks = file.checks.iter().map(|c| json!({ "what": c.what, "worst": c.worst, "limit": c.limit }));
+    // What is for information has no limit, but words.
+    let checks = file.checks.iter().map(|c| {
+        let limit = c.limit.is_finite().then_some(c.limit);
+        json!({ "what": c.what, "worst": c.worst, "limit": limit, "words": c.words })
+    });
     json!({
         "path": file.path,
         "format": file.format,

@@ -70,7 +70,7 @@ pub(super) fn verify(recording: &Trajectory, report: &mut DroneReport) {
 
 /// One step of rapier from every recorded state.
 fn one_step(recording: &Trajectory, laws: &Laws, report: &mut DroneReport) {
-    let (mut motion, mut attitude, mut fast, mut fastest) = (0.0, 0.0, 0.0, 0.0f64);
+    let (mut motion, mut attitude, mut fast, mut fastest, mut beyond) = (0.0, 0.0, 0.0, 0.0f64, 0.0f64);
     for t in 0..recording.steps() {
         let mut world = world(recording, t);
         world.step(laws, &recording.rpm[t]);
@@ -82,6 +82,8 @@ fn one_step(recording: &Trajectory, laws: &Laws, report: &mut DroneReport) {
             if turn <= SMALL_TURN {
                 attitude = worse(attitude, error);
             } else {
+                // Half the missing angle, and a tenth for what comes after the cube.
+                beyond = worse(beyond, error / (ONE_STEP + 1.1 * turn.powi(3) / 24.0));
                 fast = worse(fast, error);
                 fastest = fastest.max(turn);
             }
@@ -90,6 +92,7 @@ fn one_step(recording: &Trajectory, laws: &Laws, report: &mut DroneReport) {
     report.measures.push(Measure::limited("rapier one step, motion", motion, ONE_STEP));
     report.measures.push(Measure::limited("rapier one step, attitude", attitude, ONE_STEP));
     if fastest > 0.0 {
+        report.measures.push(Measure::limited("rapier one step, fast turn over what it may miss", beyond, 1.0));
         report.measures.push(Measure {
             what: "rapier one step, fast turn",
             worst: fast,

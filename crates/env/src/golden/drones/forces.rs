@@ -55,7 +55,10 @@ pub(super) fn verify(root: &Field<'_>) -> Result<DroneReport, GoldenError> {
             let body = Mat3::of(attitudes[i]).back(world);
             drag = worse(drag, relative_vector(body, array(&recorded.get("drag_body_N")?)?));
             let here = positions[i];
-            let others = (0..n).filter(|&j| j != i).map(|j| sub(positions[j], here)).filter(|d| d[2] > 0.0);
+            let others = (0..n)
+                .filter(|&j| j != i)
+                .map(|j| sub(positions[j], here))
+                .filter(|d| d[2] > 0.0 && libm::hypot(d[0], d[1]) < 10.0);
             let ours: Vec<f64> = others.map(|[x, y, z]| craft.downwash(z, libm::hypot(x, y))).collect();
             let theirs = recorded.get("downwash_body_z_N")?;
             for (ours, theirs) in ours.iter().zip(theirs.each(ours.len(), Field::number)?) {

@@ -224,7 +224,14 @@ impl Trajectory {
             rpm: root.get("rpm")?.each(steps, |step| step.each(drones, array))?,
             control: if mode == Mode::Rpm { Vec::new() } else { traces(root, drones, periods)? },
             chaotic: root.get("chaotic")?.flag()?,
-            horizon: root.get("free_run_horizon_steps")?.index(MOST)?.min(steps),
+            horizon: match root.get("free_run_horizon_steps")?.index(MOST)?.min(steps) {
+                0 => {
+                    return Err(root
+                        .get("free_run_horizon_steps")?
+                        .wrong("must be at least 1, or nothing would be compared"));
+                }
+                horizon => horizon,
+            },
         })
     }
 
