@@ -43,7 +43,7 @@ pub struct CommanderArgs {
     /// Authority (PEM) that must have signed the certificate that every client has to show
     #[arg(long, env = "MAGEX_CLIENT_CA", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub client_ca: Option<PathBuf>,
-    /// Who may call, with which role: a TOML file of [[identity]] entries with hashes of tokens and certificates
+    /// Who may call, with which role: a TOML file of `[[identity]]` entries with hashes of tokens and certificates
     #[arg(long, env = "MAGEX_IDENTITIES", value_name = "FILE", help_heading = "Security")]
     pub identities: Option<PathBuf>,
     /// Listen on an address that others can reach without encryption, or without asking who calls
