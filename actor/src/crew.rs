@@ -1,18 +1,25 @@
 //! The rollout threads of one run.
 
 use crate::cache::{CacheError, WeightsCache};
+use crate::gauges::ActorGauges;
 use crate::goals::{GrpcGoals, WeightsKey};
 use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
 use bytes::Bytes;
+use magex_core::config::RunConfig;
 use magex_core::ids::Shard;
+use magex_core::task::TaskConfig;
 use magex_proto::convert::encode_result;
+use magex_proto::v1::ShardTiming;
+use magex_runtime::client::Channel;
+use magex_runtime::trace;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError, mpsc as blocking};
 use std::thread::JoinHandle;
+use std::time::Instant;
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
+use tracing::Span;
 
 /// A leased shard.
 #[derive(Debug, Clone)]
@@ -20,15 +27,31 @@ pub(crate) struct Job {
     pub(crate) lease_id: u64,
     pub(crate) shard: Shard,
     pub(crate) weights_sha256: String,
+    /// When the lease arrived.
+    pub(crate) received: Instant,
+    /// From the lease to the result's being settled.
+    pub(crate) span: Span,
 }
 
 /// What became of a job.
 #[derive(Debug)]
 pub(crate) enum Outcome {
     /// The encoded result.
-    Done { lease_id: u64, bytes: Bytes },
+    Done { lease_id: u64, done: Done },
     /// No result.
-    Failed { lease_id: u64, shard: Shard, reason: String, retryable: bool },
+    Failed { lease_id: u64, shard: Shard, error: WorkError },
+}
+
+/// A shard's result, ready to be sent.
+#[derive(Debug, Clone)]
+pub(crate) struct Done {
+    pub(crate) bytes: Bytes,
+    /// Where the time went; travels beside the result, never in it.
+    pub(crate) timing: ShardTiming,
+    /// When it was ready.
+    pub(crate) ready: Instant,
+    /// From then until it is settled; ends with this.
+    pub(crate) _upload: Span,
 }
 
 /// What all threads of a crew use.
@@ -38,6 +61,7 @@ pub(crate) struct Tools {
     pub(crate) cache: Arc<WeightsCache>,
     pub(crate) commander: Channel,
     pub(crate) runtime: Handle,
+    pub(crate) gauges: Arc<ActorGauges>,
 }
 
 /// Threads that work on one run until the crew is dismissed.
@@ -47,6 +71,7 @@ pub(crate) struct Crew {
     outcomes: mpsc::Receiver<Outcome>,
     cancelled: CancellationToken,
     cache: Arc<WeightsCache>,
+    gauges: Arc<ActorGauges>,
     threads: Vec<JoinHandle<()>>,
     /// Jobs given and not yet returned.
     busy: usize,
@@ -59,13 +84,18 @@ impl Crew {
         let (results, outcomes) = mpsc::channel(threads);
         let queue = Arc::new(Mutex::new(queue));
         let cancelled = CancellationToken::new();
-        let cache = tools.cache.clone();
-        let mut crew = Self { welcome, jobs: Some(jobs), outcomes, cancelled, cache, threads: Vec::new(), busy: 0 };
+        let (cache, gauges) = (tools.cache.clone(), tools.gauges.clone());
+        // For counting steps only; the workers read the configuration themselves, and complain.
+        let task = RunConfig::from_toml(&welcome.run_config_toml).ok().map(|config| config.task);
+        gauges.threads.set(threads as f64);
+        let (jobs, threads_of_it) = (Some(jobs), Vec::new());
+        let mut crew = Self { welcome, jobs, outcomes, cancelled, cache, gauges, threads: threads_of_it, busy: 0 };
         for number in 0..threads {
             let bench = Bench {
                 worker: (tools.make_worker)(&crew.welcome)?,
                 welcome: crew.welcome.clone(),
                 tools: tools.clone(),
+                task: task.clone(),
                 cancelled: crew.cancelled.clone(),
             };
             let (queue, results) = (queue.clone(), results.clone());
@@ -94,6 +124,7 @@ impl Crew {
         match jobs.try_send(job) {
             Ok(()) => {
                 self.busy += 1;
+                self.count();
                 Ok(())
             }
             Err(blocking::TrySendError::Full(job) | blocking::TrySendError::Disconnected(job)) => Err(job),
@@ -104,7 +135,13 @@ impl Crew {
     pub(crate) async fn next_outcome(&mut self) -> Option<Outcome> {
         let outcome = self.outcomes.recv().await?;
         self.busy = self.busy.saturating_sub(1);
+        self.count();
         Some(outcome)
+    }
+
+    fn count(&self) {
+        self.gauges.busy.set(self.busy.min(self.threads.len()) as f64);
+        self.gauges.queue("jobs", self.busy.saturating_sub(self.threads.len()));
     }
 
     /// Tells the threads that nobody wants their results, and waits for them in the background.
@@ -133,6 +170,7 @@ struct Bench {
     worker: Box<dyn Worker>,
     welcome: Welcome,
     tools: Tools,
+    task: Option<TaskConfig>,
     cancelled: CancellationToken,
 }
 
@@ -146,13 +184,8 @@ impl Bench {
                 return;
             }
             let outcome = match self.work(&job) {
-                Ok(bytes) => Outcome::Done { lease_id: job.lease_id, bytes },
-                Err(error) => Outcome::Failed {
-                    lease_id: job.lease_id,
-                    shard: job.shard,
-                    reason: error.to_string(),
-                    retryable: error.is_retryable(),
-                },
+                Ok(done) => Outcome::Done { lease_id: job.lease_id, done },
+                Err(error) => Outcome::Failed { lease_id: job.lease_id, shard: job.shard, error },
             };
             if results.blocking_send(outcome).is_err() {
                 return;
@@ -160,15 +193,21 @@ impl Bench {
         }
     }
 
-    fn work(&mut self, job: &Job) -> Result<Bytes, WorkError> {
+    fn work(&mut self, job: &Job) -> Result<Done, WorkError> {
+        let begun = Instant::now();
+        let span = tracing::info_span!(target: trace::TARGET, parent: &job.span, "weights wait");
         let run_id = self.welcome.run_id.clone();
         let key = WeightsKey { run_id, version: job.shard.version, sha256: job.weights_sha256.clone() };
         let weights = self.tools.cache.wait(&key, self.welcome.lease, &self.cancelled).map_err(|error| {
             let retryable = matches!(error, CacheError::TimedOut { .. } | CacheError::Cancelled);
             WorkError::Failed { reason: error.to_string(), retryable }
         })?;
+        drop(span);
+        let weights_wait_seconds = begun.elapsed().as_secs_f64();
         let (runtime, commander) = (self.tools.runtime.clone(), self.tools.commander.clone());
         let mut goals = GrpcGoals::new(runtime, commander, key, self.welcome.lease, self.cancelled.clone());
+        goals.trace(&job.span);
+        let working = Instant::now();
         let worker = &mut self.worker;
         let result = match catch_unwind(AssertUnwindSafe(|| worker.work(&job.shard, &weights, &mut goals))) {
             Ok(result) => result?,
@@ -181,7 +220,18 @@ impl Bench {
         if *result.shard() != job.shard {
             return Err(WorkError::fatal("the worker returned the result of another shard"));
         }
-        Ok(encode_result(&self.welcome.run_id, &job.weights_sha256, &result))
+        let worked = working.elapsed().as_secs_f64();
+        let goals_wait_seconds = goals.waited().as_secs_f64();
+        let bytes = encode_result(&self.welcome.run_id, &job.weights_sha256, &result);
+        let timing = ShardTiming {
+            held_seconds: job.received.elapsed().as_secs_f64(),
+            weights_wait_seconds,
+            goals_wait_seconds,
+            rollout_seconds: (worked - goals_wait_seconds).max(0.0),
+        };
+        self.tools.gauges.done(&job.shard, self.task.as_ref(), &timing);
+        let _upload = tracing::info_span!(target: trace::TARGET, parent: &job.span, "upload", bytes = bytes.len());
+        Ok(Done { bytes, timing, ready: Instant::now(), _upload })
     }
 }
 

@@ -2,6 +2,7 @@
 pub mod cache;
 pub mod cli;
 mod crew;
+mod gauges;
 pub mod goals;
 mod link;
 pub mod policy;

@@ -2,6 +2,7 @@
 
 use crate::cache::WeightsCache;
 use crate::crew::{Crew, Tools};
+use crate::gauges::ActorGauges;
 pub use crate::link::ActorReport;
 use crate::link::{self, End, Link, Unsettled};
 use crate::weights_feed;
@@ -10,13 +11,13 @@ use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::{MAX_MESSAGE_BYTES, PROTOCOL_VERSION, v1};
 use magex_runtime::backoff::{Backoff, incarnation};
-use magex_runtime::client::{UrlError, lazy_channel};
+use magex_runtime::client::{Channel, Settings, UrlError};
+use magex_runtime::metrics::Metrics;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
 
 /// The learner answers a hello within this time, or the connection is made anew.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
@@ -31,6 +32,8 @@ pub struct ActorConfig {
     pub learner_url: String,
     /// The commander, `http://host:port`.
     pub commander_url: String,
+    /// What both are shown.
+    pub client: Settings,
     /// Name of the actor, for people.
     pub actor_id: String,
     /// Rollout threads, at least 1.
@@ -58,6 +61,17 @@ pub enum ActorError {
         /// What it said.
         reason: String,
     },
+    /// The learner cannot use what this actor computes.
+    #[error("the learner at {url} sent this actor away: {reason}")]
+    SentAway {
+        /// Address of the learner.
+        url: String,
+        /// What it said.
+        reason: String,
+    },
+    /// No shard can be done here.
+    #[error("this actor can do no shard: {0}")]
+    Useless(WorkError),
     /// The run's work cannot be done here.
     #[error("cannot work on run '{run_id}': {source}")]
     Worker {
@@ -75,17 +89,29 @@ pub async fn run(
     make_worker: MakeWorker,
     shutdown: CancellationToken,
 ) -> Result<ActorReport, ActorError> {
+    run_watched(config, make_worker, &Metrics::new(), shutdown).await
+}
+
+/// [`run`], counting what it does.
+pub async fn run_watched(
+    config: ActorConfig,
+    make_worker: MakeWorker,
+    metrics: &Metrics,
+    shutdown: CancellationToken,
+) -> Result<ActorReport, ActorError> {
     if config.threads == 0 {
         return Err(ActorError::NoThreads);
     }
     let cache = Arc::new(WeightsCache::default());
-    let commander = lazy_channel(&config.commander_url)?;
+    let commander = config.client.lazy_channel(&config.commander_url)?;
     let runtime = tokio::runtime::Handle::current();
     // Two connections: results on the one never delay weights on the other.
-    let feed = weights_feed::follow(lazy_channel(&config.learner_url)?, config.actor_id.clone(), cache.clone());
+    let gauges = Arc::new(ActorGauges::new(metrics));
+    let feed = config.client.lazy_channel(&config.learner_url)?;
+    let feed = weights_feed::follow(feed, config.actor_id.clone(), cache.clone(), gauges.clone());
     let feed = tokio::spawn(feed);
-    let tools = Tools { make_worker, cache, commander, runtime };
-    let bulk = lazy_channel(&config.learner_url)?;
+    let tools = Tools { make_worker, cache, commander, runtime, gauges };
+    let bulk = config.client.lazy_channel(&config.learner_url)?;
     let mut actor = Actor {
         config,
         tools,
@@ -129,10 +155,18 @@ impl Actor {
                     tracing::info!(accepted = self.report.accepted, "the run is complete");
                     return Ok(());
                 }
-                End::Finished => tracing::info!("the run is complete; waiting for another"),
+                End::Finished if waiting => tracing::debug!("no other run yet"),
+                End::Finished => {
+                    tracing::info!("the run is complete; waiting for another");
+                    waiting = true;
+                }
                 End::Refused(reason) => {
                     return Err(ActorError::Refused { url: self.config.learner_url.clone(), reason });
                 }
+                End::SentAway(reason) => {
+                    return Err(ActorError::SentAway { url: self.config.learner_url.clone(), reason });
+                }
+                End::Useless(error) => return Err(ActorError::Useless(error)),
                 End::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
                 End::Broken(reason) => {
                     tracing::warn!(
@@ -172,9 +206,14 @@ impl Actor {
             Some(Ok(Ok(greeted))) => greeted,
         };
         self.report.sessions += 1;
+        let gauges = self.tools.gauges.clone();
+        gauges.reconnects.add(u64::from(self.report.sessions > 1));
         let crew = self.crew_for(welcome).await?;
-        let link = Link::new(self.crew.insert(crew), &mut self.unsettled, &mut self.report, outbound);
-        Ok(link.serve(inbound, shutdown).await)
+        gauges.connected.set(1.0);
+        let link = Link::new(self.crew.insert(crew), &mut self.unsettled, &mut self.report, &gauges, outbound);
+        let end = link.serve(inbound, shutdown).await;
+        gauges.connected.set(0.0);
+        Ok(end)
     }
 
     fn hello(&self) -> v1::Hello {

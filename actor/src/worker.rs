@@ -50,12 +50,19 @@ impl WorkError {
         Self::Failed { reason: reason.into(), retryable: false }
     }
 
-    /// Another attempt may succeed.
+    /// Another attempt may succeed, here or at another actor.
     pub fn is_retryable(&self) -> bool {
         match self {
-            Self::Goals(error) => matches!(error, GoalError::Cancelled | GoalError::Late(_)),
+            Self::Goals(error) => {
+                matches!(error, GoalError::Cancelled | GoalError::Late(_) | GoalError::NotLetIn(_))
+            }
             Self::Failed { retryable, .. } => *retryable,
         }
+    }
+
+    /// Every shard would fail so at this actor, whoever else could do it.
+    pub fn ends_the_actor(&self) -> bool {
+        matches!(self, Self::Goals(GoalError::NotLetIn(_)))
     }
 }
 

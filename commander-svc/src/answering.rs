@@ -3,6 +3,8 @@
 //! Small teams are answered where the call came in: handing them to another thread costs more than the answer. Large ones
 //! go to threads of their own, as many at once as there are processors and as there is memory.
 
+use crate::batch::Gone;
+use crate::gauges::CommanderGauges;
 use crate::scheduler::{Scheduler, SchedulerKind, TeamReply, TeamRequest, WeightsKey};
 use crate::store::Store;
 use magex_dispatch::mission::Planned;
@@ -12,7 +14,7 @@ use magex_runtime::backoff::incarnation;
 use magex_runtime::status;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
@@ -44,6 +46,7 @@ const UNITS: usize = 26;
 #[derive(Debug)]
 pub(crate) struct Answering {
     store: Arc<Store>,
+    pub(crate) gauges: Arc<CommanderGauges>,
     processors: Arc<Semaphore>,
     memory: Arc<Semaphore>,
     /// How long the model took for a small team lately, nanoseconds: the slowest, slowly forgotten. Decides only on which
@@ -81,30 +84,31 @@ impl Clock {
         if self.own { left } else { left.min(LEARNED_PATIENCE) }
     }
 
-    fn over(&self) -> bool {
+    /// Since the request came in.
+    pub(crate) fn elapsed(&self) -> Duration {
+        self.start.elapsed()
+    }
+
+    /// Until the answer is wanted no more.
+    pub(crate) fn left(&self) -> Duration {
+        self.until.saturating_duration_since(Instant::now())
+    }
+
+    /// The answer is wanted no more.
+    pub(crate) fn over(&self) -> bool {
         Instant::now() >= self.until
     }
 }
 
 /// A processor, and memory.
-type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
-
-/// Set when the caller has gone: whatever still works for it stops.
-#[derive(Debug, Default)]
-struct Gone(Arc<AtomicBool>);
-
-impl Drop for Gone {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
+pub(crate) type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
 
 impl Answering {
-    pub(crate) fn new(store: Arc<Store>) -> Arc<Self> {
+    pub(crate) fn new(store: Arc<Store>, gauges: Arc<CommanderGauges>) -> Arc<Self> {
         let processors = Arc::new(Semaphore::new(magex_runtime::process::processors()));
         let (memory, next_seed) = (Arc::new(Semaphore::new(UNITS)), AtomicU64::new(incarnation()));
         let pace = AtomicU64::new(u64::MAX);
-        Arc::new(Self { store, processors, memory, pace, next_seed })
+        Arc::new(Self { store, gauges, processors, memory, pace, next_seed })
     }
 
     /// A seed for a request without one.
@@ -126,20 +130,23 @@ impl Answering {
         if let Some((version, sha256, run)) = planned.weights {
             (response.version, response.sha256, response.run_id) = (version, sha256, run);
         }
-        response.seconds = clock.start.elapsed().as_secs_f64();
+        let took = clock.elapsed();
+        response.seconds = took.as_secs_f64();
+        self.gauges.answered(response.scheduler().into(), !response.fallback_reason.is_empty(), took);
         Ok(response)
     }
 
     async fn plan(self: &Arc<Self>, problem: &Arc<Problem>, clock: &Clock) -> Result<Planned, Status> {
         let learned = problem.scheduler == SchedulerKind::Learned;
         let here = if learned { self.small_for_model(problem, clock) } else { problem.cells() <= SMALL };
+        let cells = if learned { engine::learned_cells(problem) } else { problem.cells() };
         let on_the_spot = |planned: Planned| if clock.over() { Err(too_late()) } else { Ok(planned) };
         if here {
             let planned = self.plan_here(problem, clock.learned(), &|| !clock.over()).map_err(refusal)?;
             return on_the_spot(planned);
         }
         let mut reason = String::new();
-        let places = match self.places(problem, clock).await {
+        let places = match self.places(cells, clock.left()).await {
             Ok(places) => Arc::new(places),
             Err(_) if learned && problem.cells() <= SMALL => {
                 let plan = engine::solve(problem, SchedulerKind::Exact, &|| !clock.over()).map_err(refusal)?;
@@ -176,29 +183,31 @@ impl Answering {
             return problem.cells() <= SMALL;
         }
         let pace = Duration::from_nanos(self.pace.load(Ordering::Relaxed));
-        problem.cells() <= SMALL_LEARNED && pace.saturating_mul(MARGIN) <= clock.learned()
+        engine::learned_cells(problem) <= SMALL_LEARNED && pace.saturating_mul(MARGIN) <= clock.learned()
     }
 
-    /// A processor for work that is not one team's.
-    pub(crate) async fn processor(&self) -> Result<OwnedSemaphorePermit, Status> {
-        match tokio::time::timeout(QUEUE_PATIENCE, self.processors.clone().acquire_owned()).await {
-            Ok(Ok(permit)) => Ok(permit),
-            _ => Err(busy()),
-        }
+    /// Processors that have nothing to do for large teams.
+    pub(crate) fn free_processors(&self) -> usize {
+        self.processors.available_permits()
     }
 
-    /// A processor and memory for a large team.
-    async fn places(&self, problem: &Problem, clock: &Clock) -> Result<Places, Status> {
-        let units = problem.cells().div_ceil(UNIT).clamp(1, UNITS) as u32;
-        let patience = QUEUE_PATIENCE.min(clock.until.saturating_duration_since(Instant::now()));
+    /// A processor and memory for so many pairs.
+    pub(crate) async fn places(&self, cells: usize, patience: Duration) -> Result<Places, Status> {
+        let patience = QUEUE_PATIENCE.min(patience);
         let both = async {
-            let memory = self.memory.clone().acquire_many_owned(units).await.ok()?;
+            let memory = self.memory(cells).await?;
             Some((self.processors.clone().acquire_owned().await.ok()?, memory))
         };
         match tokio::time::timeout(patience, both).await {
             Ok(Some(places)) => Ok(places),
             _ => Err(busy()),
         }
+    }
+
+    /// Memory for so many pairs, as soon as there is some; `None` never.
+    pub(crate) async fn memory(&self, cells: usize) -> Option<OwnedSemaphorePermit> {
+        let units = cells.div_ceil(UNIT).clamp(1, UNITS) as u32;
+        self.memory.clone().acquire_many_owned(units).await.ok()
     }
 
     /// Asks the learned scheduler on another thread and leaves it there if it takes too long.
@@ -208,10 +217,12 @@ impl Answering {
         clock: &Clock,
         places: Arc<Places>,
     ) -> Result<Planned, String> {
-        let (own, asked, patience) = (self.clone(), problem.clone(), clock.learned());
+        let (own, asked, patience, until) = (self.clone(), problem.clone(), clock.learned(), clock.until);
+        let gone = Gone::default();
+        let flag = gone.0.clone();
         let answer = tokio::task::spawn_blocking(move || {
             let _held = places;
-            own.ask_learned(&asked, &|| true)
+            own.ask_learned(&asked, &|| !flag.load(Ordering::Relaxed) && Instant::now() < until)
         });
         match tokio::time::timeout(patience, answer).await {
             Ok(Ok(answer)) => answer,
@@ -248,15 +259,23 @@ impl Answering {
         let Some((key, scheduler)) = self.store.latest() else {
             return Err("no model is loaded".to_owned());
         };
+        // Nobody may be waiting any more when a thread is free.
+        if !go_on() {
+            return Err("there was no time left for the model".to_owned());
+        }
         let start = Instant::now();
         let reply = ask(problem, scheduler.as_ref());
-        if problem.cells() <= SMALL_LEARNED {
+        if engine::learned_cells(problem) <= SMALL_LEARNED {
             let took = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
             let before = self.pace.load(Ordering::Relaxed);
             let before = if before == u64::MAX { 0 } else { before - before / 8 };
             self.pace.store(took.max(before), Ordering::Relaxed);
         }
         let reply = reply?;
+        // What follows is for somebody who still waits.
+        if !go_on() {
+            return Err("the model was late".to_owned());
+        }
         let plan = engine::adopt(problem, reply.goals, reply.probabilities, go_on)?;
         Ok(Planned { plan, fallback_reason: String::new(), weights: Some(names(&key)) })
     }

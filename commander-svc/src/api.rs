@@ -1,36 +1,40 @@
 //! The contract on top of the parts: who may, what is asked, who answers.
 
-use crate::access::{Caller, Role, caller};
-use crate::admission::{Admission, Kind, Slot};
 use crate::answering::{Answering, Clock};
-use crate::classical;
+use crate::batch::{self, Batches};
 use crate::keeper::{self, Keeper};
 use crate::metadata;
-use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind, WeightsKey};
+use crate::scheduler::{GoalRequest, SchedulerKind};
 use crate::store::Store;
 use crate::streams::{self, Interest};
 use magex_dispatch::{Limits, Problem};
 use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
-use magex_runtime::status;
+use magex_runtime::access::{Role, caller};
+use magex_runtime::admission::Admission;
+use magex_runtime::{status, trace};
 use std::sync::Arc;
-use std::time::Duration;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
-
-/// How long an actor's request waits for the weights that it names.
-const WEIGHTS_PATIENCE: Duration = Duration::from_secs(5);
+use tracing::Instrument as _;
 
 /// Missions that a watcher may name.
 const WATCHED: usize = 1000;
+
+/// Who asks for assignments.
+const CLIENT: &[Role] = &[Role::Client];
+
+/// Methods that stay open.
+pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments"];
 
 /// Implements the contract.
 #[derive(Debug)]
 pub(crate) struct CommanderApi {
     pub(crate) store: Arc<Store>,
     pub(crate) answering: Arc<Answering>,
+    pub(crate) batches: Batches,
     pub(crate) keeper: Arc<Keeper>,
     pub(crate) admission: Arc<Admission>,
     pub(crate) limits: Limits,
@@ -38,49 +42,6 @@ pub(crate) struct CommanderApi {
 }
 
 type Answer<T> = Result<Response<T>, Status>;
-
-impl CommanderApi {
-    /// Lets a client's call in.
-    fn client<T>(&self, request: &Request<T>, kind: Kind) -> Result<(Caller, Slot), Status> {
-        let caller = caller(request, &[Role::Client])?;
-        let slot = self.admission.enter(&caller, kind)?;
-        Ok((caller, slot))
-    }
-
-    async fn batch_with(&self, request: Arc<GoalRequest>, key: &WeightsKey) -> Result<GoalReply, Status> {
-        if request.scheduler != SchedulerKind::Learned {
-            return blocking(move || classical::assign_batch(&request)).await;
-        }
-        let wait = self.store.wait(key, WEIGHTS_PATIENCE);
-        let Some(model) = self.draining.run_until_cancelled(wait).await.flatten() else {
-            let (version, run) = (key.version, &key.run_id);
-            let problem = format!("weights version {version} of run '{run}' are not here yet");
-            return Err(status::unavailable(problem, Duration::from_millis(500)));
-        };
-        match model.scheduler {
-            Ok(scheduler) => blocking(move || scheduler.assign_batch(&request)).await,
-            Err(reason) => Err(status::failed_precondition(format!("weights version {}: {reason}", key.version))),
-        }
-    }
-}
-
-/// Runs work of the processor away from the threads that serve the network.
-async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, AssignError> + Send + 'static,
-) -> Result<T, Status> {
-    match tokio::task::spawn_blocking(work).await {
-        Ok(result) => result.map_err(to_status),
-        Err(error) => Err(Status::internal(error.to_string())),
-    }
-}
-
-fn to_status(error: AssignError) -> Status {
-    match error {
-        AssignError::Invalid { field, problem } => status::invalid_argument(field, problem),
-        AssignError::Unsupported(reason) => status::failed_precondition(reason),
-        AssignError::Failed(reason) => Status::internal(reason),
-    }
-}
 
 fn invalid(error: ConvertError) -> Status {
     status::invalid_argument(error.field, error.problem)
@@ -92,14 +53,14 @@ impl CommanderService for CommanderApi {
     type WatchAssignmentsStream = ReceiverStream<Result<v1::WatchAssignmentsResponse, Status>>;
 
     async fn assign(&self, request: Request<v1::AssignRequest>) -> Answer<v1::AssignResponse> {
-        let (_, _slot) = self.client(&request, Kind::Call)?;
+        caller(&request, CLIENT)?;
         let clock = Clock::start(metadata::deadline(request.metadata()));
         let problem = Problem::read(request.into_inner(), self.answering.seed(), &self.limits).map_err(invalid)?;
         self.answering.respond(problem, clock).await.map(Response::new)
     }
 
     async fn assign_many(&self, request: Request<v1::AssignManyRequest>) -> Answer<v1::AssignManyResponse> {
-        let (_, _slot) = self.client(&request, Kind::Call)?;
+        caller(&request, CLIENT)?;
         let clock = Clock::start(metadata::deadline(request.metadata()));
         let teams = request.into_inner().teams;
         if teams.is_empty() || teams.len() > self.limits.teams {
@@ -124,40 +85,45 @@ impl CommanderService for CommanderApi {
         &self,
         request: Request<Streaming<v1::AssignStreamRequest>>,
     ) -> Answer<Self::AssignStreamStream> {
-        let (_, slot) = self.client(&request, Kind::Stream)?;
+        caller(&request, CLIENT)?;
         let (answers, stream) = streams::channel();
         let (answering, admission, draining) = (self.answering.clone(), self.admission.clone(), self.draining.clone());
         let teams = request.into_inner();
-        tokio::spawn(streams::assign(answering, admission, self.limits, teams, answers, draining, slot));
+        tokio::spawn(streams::assign(answering, admission, self.limits, teams, answers, draining));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
     async fn assign_batch(&self, request: Request<v1::AssignBatchRequest>) -> Answer<v1::AssignBatchResponse> {
-        let caller = caller(&request, &[Role::Actor])?;
-        let _slot = self.admission.enter(&caller, Kind::Call)?;
+        caller(&request, &[Role::Actor])?;
+        let span = tracing::info_span!(target: trace::TARGET, parent: None, "assign batch");
+        trace::continue_from(&span, trace::of(request.metadata()));
+        let clock = Clock::start(metadata::deadline(request.metadata()));
         let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(invalid)?;
+        batch::check(&request, &key, &self.limits)?;
         let version = request.shard.version;
         let request = Arc::new(request);
-        let reply = Arc::new(self.batch_with(request.clone(), &key).await?);
+        let answer = self.batches.answer(request.clone(), &key, clock, &self.draining);
+        let reply = Arc::new(answer.instrument(span).await?);
+        self.answering.gauges.answered(request.scheduler, false, clock.elapsed());
         let message = reply.to_message(&request, version);
         self.keeper.record(request, reply, key);
         Ok(Response::new(message))
     }
 
     async fn create_mission(&self, request: Request<v1::CreateMissionRequest>) -> Answer<v1::CreateMissionResponse> {
-        let (caller, _slot) = self.client(&request, Kind::Call)?;
+        let caller = caller(&request, CLIENT)?;
         let assignment = Some(self.keeper.create(caller, request.into_inner()).await?);
         Ok(Response::new(v1::CreateMissionResponse { assignment }))
     }
 
     async fn update_mission(&self, request: Request<v1::UpdateMissionRequest>) -> Answer<v1::UpdateMissionResponse> {
-        let (caller, _slot) = self.client(&request, Kind::Call)?;
+        let caller = caller(&request, CLIENT)?;
         let assignment = Some(self.keeper.update(caller, request.into_inner()).await?);
         Ok(Response::new(v1::UpdateMissionResponse { assignment }))
     }
 
     async fn get_assignment(&self, request: Request<v1::GetAssignmentRequest>) -> Answer<v1::GetAssignmentResponse> {
-        let (caller, _slot) = self.client(&request, Kind::Call)?;
+        let caller = caller(&request, CLIENT)?;
         let assignment = Some(self.keeper.get(&caller, &request.into_inner().mission_id)?);
         Ok(Response::new(v1::GetAssignmentResponse { assignment }))
     }
@@ -166,7 +132,7 @@ impl CommanderService for CommanderApi {
         &self,
         request: Request<v1::ListAssignmentsRequest>,
     ) -> Answer<v1::ListAssignmentsResponse> {
-        let (caller, _slot) = self.client(&request, Kind::Call)?;
+        let caller = caller(&request, CLIENT)?;
         self.keeper.list(&caller, &request.into_inner()).map(Response::new)
     }
 
@@ -174,7 +140,7 @@ impl CommanderService for CommanderApi {
         &self,
         request: Request<v1::WatchAssignmentsRequest>,
     ) -> Answer<Self::WatchAssignmentsStream> {
-        let (caller, slot) = self.client(&request, Kind::Stream)?;
+        let caller = caller(&request, CLIENT)?;
         let request = request.into_inner();
         if request.mission_ids.len() > WATCHED {
             let problem =
@@ -184,12 +150,12 @@ impl CommanderService for CommanderApi {
         let source = keeper::source("source", request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
         let (watcher, stream) = streams::channel();
-        tokio::spawn(streams::watch(self.keeper.clone(), interest, watcher, self.draining.clone(), slot));
+        tokio::spawn(streams::watch(self.keeper.clone(), interest, watcher, self.draining.clone()));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
     async fn delete_mission(&self, request: Request<v1::DeleteMissionRequest>) -> Answer<v1::DeleteMissionResponse> {
-        let (caller, _slot) = self.client(&request, Kind::Call)?;
+        let caller = caller(&request, CLIENT)?;
         self.keeper.delete(caller, request.into_inner().mission_id).await?;
         Ok(Response::new(v1::DeleteMissionResponse {}))
     }
@@ -199,13 +165,15 @@ impl CommanderService for CommanderApi {
         let latest = self.store.latest();
         let mut kinds =
             vec![SchedulerKind::Exact, SchedulerKind::Makespan, SchedulerKind::Greedy, SchedulerKind::Random];
-        if latest.is_some() {
+        // The model of a run with a classical scheduler answers that run's actors, and nobody else.
+        let ready = latest.as_ref().is_some_and(|(_, scheduler)| scheduler.teams());
+        if ready {
             kinds.insert(0, SchedulerKind::Learned);
         }
         let schedulers = kinds.into_iter().map(|kind| v1::SchedulerKind::from(kind).into()).collect();
         let response = match latest {
             Some((key, _)) => v1::GetModelResponse {
-                ready: true,
+                ready,
                 run_id: key.run_id.0.clone(),
                 version: key.version.0,
                 sha256: key.sha256.clone(),

@@ -44,7 +44,7 @@ fn answer(
 }
 
 /// Goals for the episodes of a shard.
-pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignError> {
+pub(crate) fn assign_batch(request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
     let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     if g < n {
         return Err(AssignError::invalid("goals", format!("{g} goals are not enough for {n} agents")));
@@ -57,6 +57,9 @@ pub(crate) fn assign_batch(request: &GoalRequest) -> Result<GoalReply, AssignErr
     let teams = request.agents.chunks_exact(n * d).zip(request.goals.chunks_exact(g * d));
     let mut stream = episode_keys(request.seed, &request.shard, 0).commander.stream();
     for (index, (agents, goals)) in teams.enumerate() {
+        if !go_on() {
+            return Err(AssignError::Interrupted);
+        }
         if index % k == 0 {
             stream = episode_keys(request.seed, &request.shard, (index / k) as u32).commander.stream();
         }

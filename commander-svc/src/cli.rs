@@ -1,6 +1,5 @@
 //! The commander's command line.
 
-use crate::access::Access;
 use crate::service::{CommanderConfig, ServeError, run as serve};
 use crate::trained::load_scheduler;
 use crate::weights_file::WeightsFile;
@@ -9,11 +8,15 @@ use magex_dispatch::Limits;
 use magex_dispatch::mission::MissionLimits;
 use magex_dispatch::missions::Bounds;
 use magex_runtime::exit::{self, Failure};
-use magex_runtime::telemetry::{self, LogFormat};
-use magex_runtime::tls::ServerTls;
+use magex_runtime::health::probe;
+use magex_runtime::http::{self, HttpArgs, Page};
+use magex_runtime::metrics::Metrics;
+use magex_runtime::security::{ClientArgs, ServerArgs};
+use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
 use magex_runtime::{process, server, shutdown};
 use serde::Serialize;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Options of a commander.
@@ -34,21 +37,14 @@ pub struct CommanderArgs {
     /// Folder in which missions are kept; without it they end with the process
     #[arg(long, env = "MAGEX_DATA", value_name = "DIR")]
     pub data: Option<PathBuf>,
-    /// Certificate chain of this server (PEM)
-    #[arg(long, env = "MAGEX_TLS_CERT", value_name = "FILE", requires = "tls_key", help_heading = "Security")]
-    pub tls_cert: Option<PathBuf>,
-    /// Key of that certificate (PEM)
-    #[arg(long, env = "MAGEX_TLS_KEY", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
-    pub tls_key: Option<PathBuf>,
-    /// Authority (PEM) that must have signed the certificate that every client has to show
-    #[arg(long, env = "MAGEX_CLIENT_CA", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
-    pub client_ca: Option<PathBuf>,
-    /// Who may call, with which role: a TOML file of `[[identity]]` entries with hashes of tokens and certificates
-    #[arg(long, env = "MAGEX_IDENTITIES", value_name = "FILE", help_heading = "Security")]
-    pub identities: Option<PathBuf>,
-    /// Listen on an address that others can reach without encryption, or without asking who calls
-    #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
-    pub insecure: bool,
+    /// How the port is guarded.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub security: ServerArgs,
+    /// What the learner is shown.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub client: ClientArgs,
     /// Most agents, and most goals, of one team
     #[arg(long, default_value_t = 5000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000), help_heading = "Limits")]
     pub max_agents: u32,
@@ -76,6 +72,14 @@ pub struct CommanderArgs {
     /// Milliseconds for which a service that was told to stop still answers, saying so, before it closes its doors
     #[arg(long, default_value_t = 500, value_name = "MS", value_parser = clap::value_parser!(u32).range(..=5000))]
     pub drain: u32,
+    /// What operators look at
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub http: HttpArgs,
+    /// Where traces go
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub traces: TraceArgs,
     /// How log lines look
     #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
     #[serde(skip)]
@@ -84,6 +88,10 @@ pub struct CommanderArgs {
     #[arg(long)]
     #[serde(skip)]
     pub print_config: bool,
+    /// Ask the commander that listens on --listen whether it serves, and exit: 0 it does, 1 it does not
+    #[arg(long)]
+    #[serde(skip)]
+    pub health_check: bool,
 }
 
 impl CommanderArgs {
@@ -93,78 +101,72 @@ impl CommanderArgs {
             Some(path) => Some(WeightsFile::find(path, self.config.as_deref()).map_err(Failure::usage)?),
             None => None,
         };
-        let access = self.identities.as_deref().map(Access::read).transpose().map_err(Failure::usage)?;
-        let tls = match (&self.tls_cert, &self.tls_key) {
-            (Some(certificate), Some(key)) => {
-                Some(ServerTls::read(certificate, key, self.client_ca.as_deref()).map_err(Failure::usage)?)
-            }
-            _ => None,
-        };
+        let security = self.security.read(&self.listen)?;
+        let client = self.client.read(self.security.own(), self.security.insecure)?;
         let each = MissionLimits {
             members: self.mission_agents as usize,
             lifetime_ms: i64::from(self.mission_hours) * 3_600_000,
         };
-        let config = CommanderConfig {
+        Ok(CommanderConfig {
             learner_url: self.learner.clone(),
+            client,
             weights,
             data: self.data.clone(),
-            access: access.unwrap_or_default(),
-            tls,
+            security,
             limits: Limits { members: self.max_agents as usize, ..Limits::default() },
             message_bytes: (self.max_message as usize) << 20,
             calls: self.calls_per_client as usize,
             streams: self.streams_per_client as usize,
-            missions: Bounds { total: self.max_missions as usize, per_owner: self.missions_per_client as usize, each },
+            missions: Bounds {
+                total: self.max_missions as usize,
+                per_owner: self.missions_per_client as usize,
+                each,
+                ..Bounds::default()
+            },
             drain: Duration::from_millis(u64::from(self.drain)),
-        };
-        self.check_exposure(&config)?;
-        Ok(config)
-    }
-
-    /// An address that others can reach needs encryption and callers that are known, unless that was given up by name.
-    fn check_exposure(&self, config: &CommanderConfig) -> Result<(), Failure> {
-        let address = server::resolve(&self.listen).map_err(Failure::usage)?;
-        let known = config.access.restricted() || config.tls.as_ref().is_some_and(ServerTls::mutual);
-        if address.ip().is_loopback() || self.insecure || (config.tls.is_some() && known) {
-            return Ok(());
-        }
-        let missing = match (config.tls.is_some(), known) {
-            (false, false) => "--tls-cert and --tls-key, and --identities or --client-ca",
-            (false, true) => "--tls-cert and --tls-key",
-            _ => "--identities or --client-ca",
-        };
-        Err(Failure::usage(format!(
-            "--listen {}: others can reach this address; add {missing}, or --insecure to let anybody in",
-            self.listen
-        )))
+            metrics: Arc::new(Metrics::new()),
+        })
     }
 }
 
 /// Serves until told to stop. The exit code, or why it failed.
 pub fn run(args: CommanderArgs) -> Result<u8, Failure> {
+    if args.health_check {
+        return probe::own(&args.listen, args.security.tls_cert.is_some());
+    }
     if args.print_config {
         process::print(&toml::to_string(&args).map_err(Failure::usage)?);
         return Ok(exit::OK);
     }
     let config = args.config()?;
-    telemetry::init(args.log_format);
+    process::allow_open_files();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("magex-net")
         .enable_all()
         .build()
         .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    let telemetry = {
+        let _runtime = runtime.enter();
+        telemetry::init("magex-commander", args.log_format, &args.traces).map_err(Failure::usage)?
+    };
     let end = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
         let (incoming, address) =
             server::bind(&args.listen).await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-        process::announce_ready("commander", Some(address));
+        let incoming = incoming.within(args.security.connections());
+        let page = args.http.bind().await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
+        process::announce_ready("commander", Some(address), page.as_ref().map(Page::address));
+        if let Some(page) = page {
+            page.serve(http::routes(config.metrics.clone()), stop.clone());
+        }
         serve(config, load_scheduler, incoming, stop).await.map_err(|error| match &error {
             ServeError::Url(_) | ServeError::Weights(_) | ServeError::Tls(_) => Failure::usage(&error),
             ServeError::Missions { .. } | ServeError::Data { .. } => Failure::new(exit::CANNOT_CREATE, &error),
             ServeError::Transport(_) | ServeError::Reflection(_) => Failure::new(exit::INTERNAL, &error),
         })
     });
+    telemetry.flush();
     runtime.shutdown_background();
     end.map(|()| exit::OK)
 }

@@ -1,15 +1,17 @@
 //! Missions behind the API: planned on threads of their own, kept, and told to whoever watches.
 
-use crate::access::{Caller, Role};
 use crate::answering::{Answering, refusal};
+use crate::batch::Gone;
 use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
-use crate::training::{Training, TrainingShard};
+use crate::training::{Episode, Training, TrainingShard};
 use magex_dispatch::mission::{Mission, Planned};
 use magex_dispatch::missions::{KeepError, Missions, passes};
 use magex_dispatch::{DispatchError, Problem};
 use magex_proto::v1;
+use magex_runtime::access::{Caller, Role};
 use magex_runtime::backoff::incarnation;
 use magex_runtime::status;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::sync::broadcast;
@@ -23,8 +25,12 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const ATTEMPTS: u32 = 16;
 /// When to come back to a service that keeps as many missions as it may.
 const FULL: Duration = Duration::from_secs(10);
+/// When to come back to one whose disk takes nothing: not before it is tried again.
+const NO_DISK: Duration = Duration::from_secs(2);
 const PAGE: usize = 50;
 const LONGEST_PAGE: usize = 500;
+/// Bytes of a page: clients take messages of 4 MiB unless told otherwise.
+const PAGE_BYTES: usize = 3 << 20;
 
 /// Something that watchers are told.
 #[derive(Debug, Clone)]
@@ -46,7 +52,8 @@ pub(crate) struct Keeper {
     order: Mutex<()>,
 }
 
-/// Milliseconds since 1970.
+/// Milliseconds since 1970: missions outlive the process, and their ages with them.
+#[allow(clippy::disallowed_methods, reason = "when a mission was made is told to people and kept across restarts")]
 pub(crate) fn now_ms() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
 }
@@ -62,14 +69,18 @@ impl Keeper {
         caller: Caller,
         request: v1::CreateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
-        let (own, permit) = (self.clone(), self.answering.processor().await?);
+        let cells = self.cells((0, 0), (request.agents.len(), request.goals.len()), learned(request.scheduler));
+        let (own, places) = (self.clone(), self.answering.places(cells, PATIENCE).await?);
+        let gone = Gone::default();
+        let waits = Waits::from(&gone);
         blocking(move || {
-            let _held = permit;
+            let _held = places;
             own.missions.check_room(&caller.name).map_err(kept)?;
             let (now, each) = (now_ms(), own.missions.bounds().each);
             let drawn = format!("m-{:016x}", incarnation());
-            let planner = |problem: &Problem| own.plan(problem);
+            let planner = |problem: &Problem| own.plan(problem, &waits);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(refusal)?;
+            waits.check()?;
             own.change(v1::WatchKind::Changed, || own.missions.insert(mission)).map_err(kept)
         })
         .await
@@ -80,27 +91,48 @@ impl Keeper {
         caller: Caller,
         request: v1::UpdateMissionRequest,
     ) -> Result<v1::Assignment, Status> {
-        let (own, permit) = (self.clone(), self.answering.processor().await?);
+        let gone = Gone::default();
+        for _ in 1..ATTEMPTS {
+            if let Some(assignment) = self.try_update(&caller, &request, Waits::from(&gone), false).await? {
+                return Ok(assignment);
+            }
+        }
+        let last = self.try_update(&caller, &request, Waits::from(&gone), true).await?;
+        last.ok_or_else(|| Status::aborted("the mission grows faster than it is planned; send fewer updates at a time"))
+    }
+
+    /// One attempt at an update; `None` if the mission has meanwhile become another than was planned for.
+    async fn try_update(
+        self: &Arc<Self>,
+        caller: &Caller,
+        request: &v1::UpdateMissionRequest,
+        waits: Waits,
+        last: bool,
+    ) -> Result<Option<v1::Assignment>, Status> {
+        let mission = self.writable(caller, &request.mission_id)?;
+        let most = self.most_cells(&mission, request);
+        let (own, places) = (self.clone(), self.answering.places(most, PATIENCE).await?);
+        let (caller, request) = (caller.clone(), request.clone());
         blocking(move || {
-            let _held = permit;
-            let each = own.missions.bounds().each;
-            let mut attempt = 0;
-            loop {
-                let before = own.writable(&caller, &request.mission_id)?;
-                let was = before.assignment.revision;
-                if let Some(expected) = request.expected_revision.filter(|&expected| expected != was) {
-                    return Err(Status::aborted(format!(
-                        "the mission is at revision {was}, not {expected}; read it again"
-                    )));
-                }
-                let planner = |problem: &Problem| own.plan(problem);
-                let next = before.update(request.clone(), now_ms(), &each, &planner).map_err(refusal)?;
-                attempt += 1;
-                match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
-                    // Planned for what is no longer so.
-                    Err(KeepError::Changed { .. }) if request.expected_revision.is_none() && attempt < ATTEMPTS => {}
-                    result => return result.map_err(kept),
-                }
+            let _held = places;
+            let before = own.writable(&caller, &request.mission_id)?;
+            let was = before.assignment.revision;
+            if let Some(expected) = request.expected_revision.filter(|&expected| expected != was) {
+                return Err(Status::aborted(format!(
+                    "the mission is at revision {was}, not {expected}; read it again"
+                )));
+            }
+            if own.most_cells(&before, &request) > most {
+                // It has grown beyond the memory that was asked for.
+                return Ok(None);
+            }
+            let (each, again) = (own.missions.bounds().each, request.expected_revision.is_none() && !last);
+            let planner = |problem: &Problem| own.plan(problem, &waits);
+            let next = before.update(request, now_ms(), &each, &planner).map_err(refusal)?;
+            waits.check()?;
+            match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
+                Err(KeepError::Changed { .. }) if again => Ok(None),
+                result => result.map(Some).map_err(kept),
             }
         })
         .await
@@ -109,8 +141,11 @@ impl Keeper {
     pub(crate) async fn delete(self: &Arc<Self>, caller: Caller, id: String) -> Result<(), Status> {
         let own = self.clone();
         blocking(move || {
-            own.writable(&caller, &id)?;
-            own.change(v1::WatchKind::Deleted, || own.missions.remove(&id)).map(drop).map_err(kept)
+            let may = |mission: &Mission| visible(&caller, mission, now_ms());
+            match own.change(v1::WatchKind::Deleted, || own.missions.remove(&id, may)) {
+                Err(KeepError::Missing(_)) => Err(own.absent(&id)),
+                result => result.map(drop).map_err(kept),
+            }
         })
         .await
     }
@@ -132,35 +167,50 @@ impl Keeper {
             0 => PAGE,
             size => size.min(LONGEST_PAGE),
         };
-        // One more tells whether there is another page.
-        let mut assignments = self.after(caller, &request.page_token, size + 1, source);
-        let more = assignments.len() > size;
-        assignments.truncate(size);
+        let (assignments, more) = self.after(caller, &request.page_token, size, source);
         let last = assignments.last().filter(|_| more);
         let next_page_token = last.map(|a| a.mission_id.clone()).unwrap_or_default();
         Ok(v1::ListAssignmentsResponse { assignments, next_page_token })
     }
 
-    /// Up to `count` assignments after this name, by name.
+    /// Up to `count` assignments after this name, by name, and no more than [`PAGE_BYTES`] unless the first alone is longer;
+    /// and whether there are more.
     pub(crate) fn after(
         &self,
         caller: &Caller,
         name: &str,
         count: usize,
         filter: v1::MissionSource,
-    ) -> Vec<v1::Assignment> {
+    ) -> (Vec<v1::Assignment>, bool) {
         let now = now_ms();
-        let mut found = Vec::new();
+        // One more tells whether there is another page.
+        let (mut missions, mut episodes) = (Vec::new(), Vec::new());
         if passes(filter, v1::MissionSource::Client) {
-            let page = self.missions.page(name, count, |mission| visible(caller, mission, now));
-            found.extend(page.iter().map(|mission| mission.assignment.clone()));
+            missions = self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
         }
         if passes(filter, v1::MissionSource::Training) {
-            found.extend(self.training.page(name, count, now));
+            episodes = self.training.page(name, count + 1, now);
         }
-        found.sort_by(|a, b| a.mission_id.cmp(&b.mission_id));
-        found.truncate(count);
-        found
+        let (mut missions, mut episodes) = (missions.iter().peekable(), episodes.iter().peekable());
+        let (mut found, mut bytes) = (Vec::new(), 0);
+        loop {
+            let client_first = match (missions.peek(), episodes.peek()) {
+                (None, None) => return (found, false),
+                (Some(mission), Some(episode)) => mission.id() <= episode.name.as_str(),
+                (mission, _) => mission.is_some(),
+            };
+            let assignment = match client_first {
+                true => missions.next().map(|mission| mission.assignment.clone()),
+                false => episodes.next().and_then(Episode::assignment),
+            };
+            // An episode that makes no sense is left out.
+            let Some(assignment) = assignment else { continue };
+            bytes += magex_proto::encoded_len(&assignment);
+            if found.len() == count || (bytes > PAGE_BYTES && !found.is_empty()) {
+                return (found, true);
+            }
+            found.push(assignment);
+        }
     }
 
     /// What happens from now on.
@@ -174,6 +224,16 @@ impl Keeper {
         self.training.insert(shard.clone());
         // Nobody may be watching.
         let _ = self.events.send(Event::Training(shard));
+    }
+
+    /// Clients' missions that are kept.
+    pub(crate) fn count(&self) -> usize {
+        self.missions.count()
+    }
+
+    /// Events that the slowest watcher has yet to see.
+    pub(crate) fn backlog(&self) -> usize {
+        self.events.len()
     }
 
     /// Lets go of the disk: another commander may have it.
@@ -197,20 +257,35 @@ impl Keeper {
         }
     }
 
-    fn plan(&self, problem: &Problem) -> Result<Planned, DispatchError> {
-        let start = Instant::now();
-        self.answering.plan_here(problem, PATIENCE, &|| start.elapsed() < PATIENCE)
+    /// The most pairs that a scheduler looks at in a mission of (agents, goals) when `more` have come.
+    fn cells(&self, (agents, goals): (usize, usize), more: (usize, usize), learned: bool) -> usize {
+        let most = self.missions.bounds().each.members;
+        let (agents, goals) = ((agents + more.0).min(most), (goals + more.1).min(most));
+        // The learned scheduler fills the smaller side up.
+        if learned { agents.max(goals).pow(2) } else { agents * goals }
+    }
+
+    fn most_cells(&self, before: &Mission, request: &v1::UpdateMissionRequest) -> usize {
+        let learned = learned(before.assignment.scheduler) || learned(request.scheduler);
+        self.cells(before.size(), (request.agents.len(), request.goals.len()), learned)
+    }
+
+    fn plan(&self, problem: &Problem, waits: &Waits) -> Result<Planned, DispatchError> {
+        self.answering.plan_here(problem, PATIENCE, &|| waits.go_on())
     }
 
     /// A mission that this caller may change.
     fn writable(&self, caller: &Caller, id: &str) -> Result<Arc<Mission>, Status> {
         let now = now_ms();
-        if let Some(mission) = self.missions.get(id).filter(|mission| visible(caller, mission, now)) {
-            return Ok(mission);
-        }
-        match self.training.get(id, now) {
-            Some(_) => Err(status::failed_precondition(format!("'{id}' is an episode of a training run: read only"))),
-            None => Err(missing(id)),
+        let found = self.missions.get(id).filter(|mission| visible(caller, mission, now));
+        found.ok_or_else(|| self.absent(id))
+    }
+
+    /// Why there is nothing of this name that a caller may change: the same words whether it is somebody else's or nobody's.
+    fn absent(&self, id: &str) -> Status {
+        match self.training.get(id, now_ms()) {
+            Some(_) => status::failed_precondition(format!("'{id}' is an episode of a training run: read only")),
+            None => missing(id),
         }
     }
 
@@ -231,6 +306,31 @@ impl Keeper {
         let _ = self.events.send(Event::Mission(kind, mission));
         assignment
     }
+}
+
+/// Whether somebody still waits for a plan: the caller's call is dropped when it hangs up and when its deadline is over.
+struct Waits {
+    gone: Arc<AtomicBool>,
+    start: Instant,
+}
+
+impl Waits {
+    fn from(gone: &Gone) -> Self {
+        Self { gone: gone.0.clone(), start: Instant::now() }
+    }
+
+    fn go_on(&self) -> bool {
+        !self.gone.load(Ordering::Relaxed) && self.start.elapsed() < PATIENCE
+    }
+
+    /// Before something is written: who was told that there was no answer finds nothing changed.
+    fn check(&self) -> Result<(), Status> {
+        if self.go_on() { Ok(()) } else { Err(refusal(DispatchError::Interrupted)) }
+    }
+}
+
+fn learned(scheduler: i32) -> bool {
+    scheduler == v1::SchedulerKind::Learned as i32
 }
 
 /// Whether a caller may know of a mission at all.
@@ -254,10 +354,11 @@ fn kept(error: KeepError) -> Status {
         KeepError::Missing(_) => Status::not_found(text),
         KeepError::Full(_) => status::resource_exhausted(text, FULL),
         KeepError::Changed { .. } => Status::aborted(text),
-        KeepError::Closed => crate::admission::stopping(),
+        KeepError::Closed => magex_runtime::admission::stopping(),
         KeepError::Disk(_) => {
             tracing::error!(error = text, "missions cannot be written");
-            Status::internal(text)
+            // The file is opened anew: this passes when there is room.
+            status::unavailable(text, NO_DISK)
         }
     }
 }
@@ -265,3 +366,6 @@ fn kept(error: KeepError) -> Status {
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, Status> + Send + 'static) -> Result<T, Status> {
     tokio::task::spawn_blocking(work).await.map_err(|error| Status::internal(error.to_string()))?
 }
+
+#[cfg(test)]
+mod tests;

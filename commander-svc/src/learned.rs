@@ -8,7 +8,13 @@ use magex_proto::goals::{GoalReply, GoalRequest};
 
 /// Assigns the goals of every stage of every episode of a shard. What is random is keyed by (seed, shard, episode).
 /// `random_share` of the training episodes get a random matching, whatever the scheduler.
-pub fn answer(commander: &Commander, random_share: f32, request: &GoalRequest) -> Result<GoalReply, CommanderError> {
+/// Interrupted once `go_on` says that nobody waits for it any more; it is asked before every team.
+pub fn answer(
+    commander: &Commander,
+    random_share: f32,
+    request: &GoalRequest,
+    go_on: &dyn Fn() -> bool,
+) -> Result<GoalReply, CommanderError> {
     let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     let b = request.shard.episodes as usize;
     if n == 0 || d == 0 || k == 0 || request.agents.len() != b * k * n * d || request.goals.len() != b * k * g * d {
@@ -28,6 +34,9 @@ pub fn answer(commander: &Commander, random_share: f32, request: &GoalRequest) -
         let mut stream = episode_keys(request.seed, &request.shard, e as u32).commander.stream();
         let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_share);
         for stage in e * k..(e + 1) * k {
+            if !go_on() {
+                return Err(CommanderError::Interrupted);
+            }
             let team = Team {
                 agents: &request.agents[stage * n * d..(stage + 1) * n * d],
                 goals: &request.goals[stage * g * d..(stage + 1) * g * d],
@@ -88,14 +97,15 @@ mod tests {
         let (stages, agent_count, goal_count, dims) = (1, 1, 1, 2);
         let good = GoalRequest { shard, seed: 1, scheduler, stages, agent_count, goal_count, dims, agents, goals };
         let commander = Commander::classical(CommanderKind::Exact).unwrap();
-        assert_eq!(answer(&commander, 0.0, &good).unwrap().goals, [0]);
+        assert_eq!(answer(&commander, 0.0, &good, &|| true).unwrap().goals, [0]);
+        assert!(matches!(answer(&commander, 0.0, &good, &|| false), Err(CommanderError::Interrupted)));
         let empty = GoalRequest { agents: Vec::new(), goals: Vec::new(), ..good };
         for request in [
             GoalRequest { stages: 0, ..empty.clone() },
             GoalRequest { agent_count: 0, goal_count: 0, ..empty.clone() },
             GoalRequest { dims: 0, ..empty },
         ] {
-            let refused = answer(&commander, 0.0, &request);
+            let refused = answer(&commander, 0.0, &request, &|| true);
             assert!(matches!(refused, Err(CommanderError::Instance(_))), "{refused:?}");
         }
     }

@@ -1,10 +1,10 @@
 //! The goal commander as a service: for the actors of a run, and for anybody who has agents and goals.
-pub mod access;
-mod admission;
 mod answering;
 mod api;
+mod batch;
 mod classical;
 pub mod cli;
+mod gauges;
 mod keeper;
 pub mod learned;
 mod metadata;

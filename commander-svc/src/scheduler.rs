@@ -46,6 +46,9 @@ pub enum AssignError {
         /// What is wrong with it.
         problem: String,
     },
+    /// Nobody waits for it any more.
+    #[error("interrupted")]
+    Interrupted,
     /// Anything else.
     #[error("{0}")]
     Failed(String),
@@ -60,8 +63,13 @@ impl AssignError {
 
 /// One version of a trained commander. Answers are pure functions of the request.
 pub trait Scheduler: Send + Sync {
-    /// Goals for the episodes of a shard; what is random is keyed by (seed, shard).
-    fn assign_batch(&self, request: &GoalRequest) -> Result<GoalReply, AssignError>;
+    /// Goals for the episodes of a shard, for as long as `go_on` says so; what is random is keyed by (seed, shard).
+    fn assign_batch(&self, request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError>;
+
+    /// It answers single teams, too.
+    fn teams(&self) -> bool {
+        true
+    }
 
     /// Goals for one team; what is random is keyed by the seed.
     fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError>;

@@ -1,9 +1,9 @@
 //! How the commander is put together and served.
 
-use crate::access::Access;
-use crate::admission::Admission;
 use crate::answering::Answering;
-use crate::api::CommanderApi;
+use crate::api::{CommanderApi, STREAMS};
+use crate::batch::Batches;
+use crate::gauges::{self, CommanderGauges};
 use crate::keeper::Keeper;
 use crate::scheduler::LoadScheduler;
 use crate::store::Store;
@@ -14,21 +14,27 @@ use magex_dispatch::disk::{Disk, DiskError};
 use magex_dispatch::missions::{Bounds, Missions};
 use magex_proto::v1::commander_service_server::CommanderServiceServer;
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_BATCH_BYTES};
-use magex_runtime::client::{UrlError, lazy_channel};
+use magex_runtime::admission::{Admission, FlightLimits, Kind};
+use magex_runtime::calls::Counted;
+use magex_runtime::client::{Settings, UrlError};
+use magex_runtime::deadline::Deadline;
+use magex_runtime::door::{Door, Open, Rules};
 use magex_runtime::health::Health;
-use magex_runtime::server;
-use magex_runtime::tls::{ServerTls, TlsError};
+use magex_runtime::metrics::Metrics;
+use magex_runtime::security::Security;
+use magex_runtime::server::{self, Incoming};
+use magex_runtime::tls::TlsError;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
-use tonic::Request;
-use tonic::service::interceptor::InterceptedService;
-use tonic::transport::server::TcpIncoming;
 
 /// How often missions are looked through for those whose time is over.
 const SWEEP: Duration = Duration::from_secs(2);
+/// Bytes of requests that are on their way or at work: of one caller, and of everybody.
+const CALLER_BYTES: usize = 64 << 20;
+const BYTES: usize = 256 << 20;
 /// Name of the file with the missions.
 const MISSIONS: &str = "missions.redb";
 
@@ -37,14 +43,14 @@ const MISSIONS: &str = "missions.redb";
 pub struct CommanderConfig {
     /// The learner whose weights are followed, `http://host:port`.
     pub learner_url: Option<String>,
+    /// What the learner is shown.
+    pub client: Settings,
     /// Weights that are there from the start, and followed.
     pub weights: Option<WeightsFile>,
     /// Folder for the missions; without it they end with the process.
     pub data: Option<PathBuf>,
-    /// Who is let in.
-    pub access: Access,
-    /// Certificates; without them nothing is encrypted.
-    pub tls: Option<ServerTls>,
+    /// How the port is guarded.
+    pub security: Security,
     /// Sizes of requests.
     pub limits: Limits,
     /// Longest message, bytes.
@@ -57,23 +63,34 @@ pub struct CommanderConfig {
     pub missions: Bounds,
     /// How long a service that was told to stop goes on saying so before it closes its doors.
     pub drain: Duration,
+    /// What it counts.
+    pub metrics: Arc<Metrics>,
 }
 
 impl Default for CommanderConfig {
     fn default() -> Self {
         Self {
             learner_url: None,
+            client: Settings::default(),
             weights: None,
             data: None,
-            access: Access::default(),
-            tls: None,
+            security: Security::default(),
             limits: Limits::default(),
             message_bytes: MAX_BATCH_BYTES,
             calls: 64,
             streams: 16,
             missions: Bounds::default(),
             drain: Duration::ZERO,
+            metrics: Arc::default(),
         }
+    }
+}
+
+impl CommanderConfig {
+    fn flights(&self) -> FlightLimits {
+        // One message of the longest kind has to fit.
+        let caller_bytes = CALLER_BYTES.max(self.message_bytes);
+        FlightLimits { calls: self.calls, streams: self.streams, caller_bytes, bytes: BYTES.max(self.message_bytes) }
     }
 }
 
@@ -118,11 +135,13 @@ pub enum ServeError {
 pub async fn run(
     config: CommanderConfig,
     load_scheduler: LoadScheduler,
-    incoming: TcpIncoming,
+    incoming: Incoming,
     shutdown: CancellationToken,
 ) -> Result<(), ServeError> {
     let store = Arc::new(Store::new());
     let classical_only = config.learner_url.is_none() && config.weights.is_none();
+    let draining = CancellationToken::new();
+    let admission = Admission::new(config.flights(), draining.clone());
     // Ends with this function, whichever way.
     let mut helpers = JoinSet::new();
     if let Some(file) = config.weights {
@@ -130,10 +149,10 @@ pub async fn run(
         helpers.spawn(file.follow(loaded, store.clone(), load_scheduler));
     }
     if let Some(url) = &config.learner_url {
-        helpers.spawn(subscription::follow(lazy_channel(url)?, store.clone(), load_scheduler));
+        helpers.spawn(subscription::follow(config.client.lazy_channel(url)?, store.clone(), load_scheduler));
     }
-    let draining = CancellationToken::new();
-    let answering = Answering::new(store.clone());
+    let gauges = Arc::new(CommanderGauges::new(&config.metrics));
+    let answering = Answering::new(store.clone(), gauges.clone());
     let keeper = Keeper::new(open_missions(config.data, config.missions).await?, answering.clone());
     let (sweeper, closer) = (keeper.clone(), keeper.clone());
     helpers.spawn(async move {
@@ -142,10 +161,11 @@ pub async fn run(
             tokio::time::sleep(SWEEP).await;
         }
     });
-    let admission = Admission::new(config.calls, config.streams, draining.clone());
     let (limits, store_of_api) = (config.limits, store.clone());
+    gauges::watch(&config.metrics, &gauges, &store, &keeper, &admission, &answering);
     let api = CommanderApi {
         store: store_of_api,
+        batches: Batches::new(store.clone(), answering.clone()),
         answering,
         keeper,
         admission: admission.clone(),
@@ -156,16 +176,19 @@ pub async fn run(
     let service = CommanderServiceServer::new(api)
         .max_decoding_message_size(config.message_bytes)
         .max_encoding_message_size(config.message_bytes.max(MAX_BATCH_BYTES));
-    let access = config.access;
-    let door = move |mut request: Request<()>| {
-        let caller = access.identify(&request)?;
-        request.extensions_mut().insert(caller);
-        Ok(request)
+    let Security { tls, access } = config.security;
+    let connections = incoming.connections();
+    let rules = Rules {
+        access,
+        admission: admission.clone(),
+        streams: STREAMS,
+        message_bytes: config.message_bytes,
+        connections: connections.clone(),
     };
-    let router = server::secure_builder(config.tls.as_ref())?
-        .add_service(health_service)
-        .add_service(InterceptedService::new(service, door));
-    let router = server::with_reflection(router, FILE_DESCRIPTOR_SET)?;
+    let router = server::secure_builder(tls.as_ref())?
+        .add_service(Open::new(health_service, connections.clone()))
+        .add_service(Counted::new(Door::new(Deadline::new(service), rules), gauges.calls.clone()));
+    let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
     let closed = CancellationToken::new();
     let (told, closing, drain) = (shutdown, closed.clone(), config.drain);
     helpers.spawn(async move {
@@ -177,7 +200,7 @@ pub async fn run(
         health.set(false).await;
         draining.cancel();
         tokio::time::sleep(drain).await;
-        tracing::debug!(calls = admission.calls(), "closing the doors");
+        tracing::debug!(calls = admission.count(Kind::Call), "closing the doors");
         closing.cancel();
     });
     let served = server::serve(router, incoming, closed, server::GRACE).await;

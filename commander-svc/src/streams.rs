@@ -1,12 +1,12 @@
 //! The streaming calls: teams one after the other, and watching missions.
 
-use crate::access::Caller;
-use crate::admission::{Admission, Slot, stopping};
 use crate::answering::{Answering, Clock};
 use crate::keeper::{Event, Keeper, now_ms, visible};
 use magex_dispatch::missions::passes;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
+use magex_runtime::access::Caller;
+use magex_runtime::admission::{Admission, stopping};
 use magex_runtime::status;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -32,7 +32,6 @@ pub(crate) async fn assign(
     mut teams: Streaming<v1::AssignStreamRequest>,
     answers: mpsc::Sender<Result<v1::AssignStreamResponse, Status>>,
     draining: CancellationToken,
-    slot: Slot,
 ) {
     loop {
         let next = tokio::select! {
@@ -45,7 +44,11 @@ pub(crate) async fn assign(
                 let clock = Clock::start(None);
                 let sequence = request.sequence;
                 let result = match admission.check_open() {
-                    Ok(()) => one(&answering, &limits, request.team, clock).await,
+                    // Whoever hangs up does not keep a processor busy.
+                    Ok(()) => tokio::select! {
+                        result = one(&answering, &limits, request.team, clock) => result,
+                        () = answers.closed() => return,
+                    },
                     Err(status) => Err(status),
                 };
                 let result = match result {
@@ -62,7 +65,6 @@ pub(crate) async fn assign(
             break;
         }
     }
-    drop(slot);
 }
 
 async fn one(
@@ -108,13 +110,7 @@ impl Interest {
 type Watcher = mpsc::Sender<Result<v1::WatchAssignmentsResponse, Status>>;
 
 /// Tells a watcher what is, and then what changes, until it goes or the service drains.
-pub(crate) async fn watch(
-    keeper: Arc<Keeper>,
-    interest: Interest,
-    watcher: Watcher,
-    draining: CancellationToken,
-    slot: Slot,
-) {
+pub(crate) async fn watch(keeper: Arc<Keeper>, interest: Interest, watcher: Watcher, draining: CancellationToken) {
     // Subscribed first: what happens during the snapshot is not missed.
     let mut events = keeper.events();
     let Some(mut told) = snapshot(&keeper, &interest, &watcher).await else { return };
@@ -146,14 +142,13 @@ pub(crate) async fn watch(
             break;
         }
     }
-    drop(slot);
 }
 
 /// Sends everything as it is. The revisions that were sent, or `None` if the watcher has gone.
 async fn snapshot(keeper: &Keeper, interest: &Interest, watcher: &Watcher) -> Option<HashMap<String, (i64, u64)>> {
     let (mut told, mut after) = (HashMap::new(), String::new());
     loop {
-        let page = keeper.after(&interest.caller, &after, PAGE, interest.source);
+        let (page, _) = keeper.after(&interest.caller, &after, PAGE, interest.source);
         let Some(last) = page.last() else { break };
         after.clone_from(&last.mission_id);
         for assignment in page.into_iter().filter(|a| interest.wants(&a.mission_id)) {

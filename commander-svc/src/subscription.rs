@@ -6,9 +6,13 @@ use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::weights::{Weights, WeightsAssembler};
 use magex_proto::{MAX_MESSAGE_BYTES, v1};
 use magex_runtime::backoff::Backoff;
+use magex_runtime::client::Channel;
 use std::sync::Arc;
+use std::time::Duration;
 use tonic::Status;
-use tonic::transport::Channel;
+
+/// A learner that does not begin to answer within this time is asked again.
+const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Follows the learner's weights for ever, through every break of the connection.
 pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: LoadScheduler) {
@@ -40,7 +44,10 @@ async fn watch(
         subscriber_id: "commander".to_owned(),
         role: v1::SubscriberRole::Commander.into(),
     };
-    let mut stream = client.watch_weights(request).await?.into_inner();
+    // The stream itself may be silent for as long as an update takes; a learner that is gone is noticed by the connection.
+    let opened = tokio::time::timeout(OPEN_TIMEOUT, client.watch_weights(request)).await;
+    let late = |_| Status::deadline_exceeded("the learner did not answer in time");
+    let mut stream = opened.map_err(late)??.into_inner();
     let mut assembler = WeightsAssembler::default();
     while let Some(message) = stream.message().await? {
         if *waiting {

@@ -29,15 +29,20 @@ pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn S
 }
 
 impl Scheduler for TrainedScheduler {
-    fn assign_batch(&self, request: &GoalRequest) -> Result<GoalReply, AssignError> {
-        answer(&self.commander, self.random_share, request).map_err(|error| match error {
+    fn assign_batch(&self, request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
+        answer(&self.commander, self.random_share, request, go_on).map_err(|error| match error {
             CommanderError::Instance(problem) => AssignError::Invalid { field: "agents".to_owned(), problem },
+            CommanderError::Interrupted => AssignError::Interrupted,
             other => AssignError::Failed(other.to_string()),
         })
     }
 
+    fn teams(&self) -> bool {
+        self.commander.kind().learned()
+    }
+
     fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
-        if !self.commander.kind().learned() {
+        if !self.teams() {
             return Err(AssignError::Unsupported("the run has no learned commander".to_owned()));
         }
         let team = Team { agents: &request.agents, goals: &request.goals, dims: request.dims };

@@ -2,7 +2,7 @@
 
 use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
 use magex_core::ids::ShardKind;
-use magex_dispatch::view::Episode;
+use magex_dispatch::view;
 use magex_proto::v1;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,6 +10,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// Shards that are kept, and numbers in them.
 const SHARDS: usize = 256;
 const NUMBERS: usize = 4 << 20;
+/// Numbers that the name of a mission counts as: a page of them looks at all names.
+const NAME: usize = 64;
 /// After so long nobody can call an episode live, milliseconds.
 const LIVE_MS: i64 = 600_000;
 
@@ -58,7 +60,7 @@ impl TrainingShard {
         let (request, reply) = (&*self.request, &*self.reply);
         let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
         let part = self.part(place % request.stages.max(1));
-        let episode = Episode {
+        let episode = view::Episode {
             run_id: &self.key.run_id.0,
             part: &part,
             index: request.shard.first_episode + (place / request.stages.max(1)) as u32,
@@ -72,12 +74,29 @@ impl TrainingShard {
             cost: f64::from(*reply.costs.get(place)?),
             exact_cost: f64::from(*reply.exact_costs.get(place)?),
             at_ms: self.at_ms,
+            expires_ms: self.at_ms + LIVE_MS,
         };
         Some(episode.assignment())
     }
 
     fn numbers(&self) -> usize {
-        self.request.agents.len() + self.request.goals.len() + self.reply.goals.len()
+        let named = NAME * self.missions();
+        named + self.request.agents.len() + self.request.goals.len() + self.reply.goals.len()
+    }
+}
+
+/// One stage of one episode of a shard.
+#[derive(Debug)]
+pub(crate) struct Episode {
+    pub(crate) name: String,
+    shard: Arc<TrainingShard>,
+    place: usize,
+}
+
+impl Episode {
+    /// As a mission.
+    pub(crate) fn assignment(&self) -> Option<v1::Assignment> {
+        self.shard.assignment(self.place)
     }
 }
 
@@ -116,7 +135,7 @@ impl Training {
     }
 
     /// Up to `count` episodes after this name, by name.
-    pub(crate) fn page(&self, after: &str, count: usize, now: i64) -> Vec<v1::Assignment> {
+    pub(crate) fn page(&self, after: &str, count: usize, now: i64) -> Vec<Episode> {
         let shards = self.live(now);
         let mut names: Vec<(String, usize, usize)> = shards
             .iter()
@@ -126,7 +145,8 @@ impl Training {
             .collect();
         names.sort_unstable();
         names.dedup_by(|a, b| a.0 == b.0);
-        names.iter().take(count).filter_map(|&(_, k, b)| shards[k].assignment(b)).collect()
+        names.truncate(count);
+        names.into_iter().map(|(name, k, place)| Episode { name, shard: shards[k].clone(), place }).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<TrainingShard>>> {

@@ -4,6 +4,9 @@
 //! `optimiser.safetensors` (Adam moments), `state.json` (counters, value statistics) and, written last, `manifest.json`
 //! with the SHA-256 of each. It is written under a temporary name, flushed to disk, and renamed.
 
+pub mod disk;
+
+use self::disk::{Disk, FileSystem};
 use crate::adam::Adam;
 use crate::commander::CommanderState;
 use crate::gae::ValueNorm;
@@ -12,11 +15,10 @@ use magex_nets::params::{ParamError, Params, from_safetensors, to_safetensors};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::Write;
+use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Format of the folder; readers refuse a newer one.
+/// Format of the folder; readers refuse any other.
 pub const FORMAT: u32 = 1;
 
 /// Why a checkpoint could not be written or read.
@@ -41,6 +43,28 @@ pub enum CheckpointError {
     /// The weights do not fit the configuration.
     #[error(transparent)]
     Weights(#[from] ParamError),
+    /// Another release wrote it.
+    #[error(
+        "checkpoint {path}: its format is {format}, this release reads format {FORMAT}; resume with the release that wrote it"
+    )]
+    Format {
+        /// Which folder.
+        path: PathBuf,
+        /// Its format.
+        format: u32,
+    },
+    /// There are some, and all are damaged.
+    #[error(
+        "{run}: none of {count} checkpoints can be used, the newest because of {newest}; restore one, or start the run anew with another --out"
+    )]
+    Unusable {
+        /// Folder of the run.
+        run: PathBuf,
+        /// How many there are.
+        count: usize,
+        /// What is wrong with the newest.
+        newest: Box<CheckpointError>,
+    },
     /// There is none.
     #[error("{0}: no usable checkpoint; start the run anew with another --out")]
     None(PathBuf),
@@ -60,7 +84,7 @@ pub struct Progress {
     pub iteration: u32,
     /// Joint environment steps trained on.
     pub joint_env_steps: u64,
-    /// Consecutive evaluations at or above the target.
+    /// Consecutive evaluations at or above the target, those of completed iterations.
     pub on_target: u32,
     /// Seconds spent before this checkpoint, over all processes of the run.
     pub wall_s: f64,
@@ -113,6 +137,12 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
+/// What every format has in common.
+#[derive(Deserialize)]
+struct Format {
+    format: u32,
+}
+
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Manifest {
@@ -120,73 +150,121 @@ struct Manifest {
     sha256: BTreeMap<String, String>,
 }
 
+const MANIFEST: &str = "manifest.json";
 const FILES: [&str; 3] = ["weights.safetensors", "optimiser.safetensors", "state.json"];
 
 /// Writes a checkpoint below `run/checkpoints` and removes the oldest beyond `keep`. Returns its folder.
 pub fn write(run: &Path, progress: &Progress, learned: &Learned, keep: u32) -> Result<PathBuf, CheckpointError> {
+    write_on(&mut FileSystem, run, progress, learned, keep)
+}
+
+/// [`write()`] on a disk of the caller's.
+pub fn write_on(
+    disk: &mut dyn Disk,
+    run: &Path,
+    progress: &Progress,
+    learned: &Learned,
+    keep: u32,
+) -> Result<PathBuf, CheckpointError> {
     let parent = run.join("checkpoints");
     let name = format!("{:06}", progress.iteration);
     let (temporary, folder) = (parent.join(format!(".{name}.tmp")), parent.join(&name));
+    if let Err(error) = fill(disk, &temporary, progress, learned) {
+        // Half a checkpoint is of no use and takes room, which may be what is missing.
+        let _ = disk.remove_dir(&temporary);
+        return Err(error);
+    }
     let io = |path: &Path| {
         let path = path.to_owned();
         move |error| CheckpointError::Io { path, error }
     };
-    if temporary.exists() {
-        fs::remove_dir_all(&temporary).map_err(io(&temporary))?;
-    }
-    fs::create_dir_all(&temporary).map_err(io(&temporary))?;
-    let state = serde_json::to_vec_pretty(progress)
-        .map_err(|e| CheckpointError::Corrupt { path: folder.join("state.json"), reason: e.to_string() })?;
-    let contents = [learned.weights()?, learned.moments()?, state];
-    let mut manifest = Manifest { format: FORMAT, sha256: BTreeMap::new() };
-    for (file, bytes) in FILES.iter().zip(&contents) {
-        write_file(&temporary.join(file), bytes)?;
-        manifest.sha256.insert((*file).to_owned(), sha256_hex(bytes));
-    }
-    let bytes = serde_json::to_vec_pretty(&manifest)
-        .map_err(|e| CheckpointError::Corrupt { path: folder.join("manifest.json"), reason: e.to_string() })?;
-    write_file(&temporary.join("manifest.json"), &bytes)?;
     // The same iteration once more, after a resume or at a stop: the old one goes only when the new one is in its place.
+    // In between it is found under its other name.
     let replaced = parent.join(format!(".{name}.old"));
-    if replaced.exists() {
-        fs::remove_dir_all(&replaced).map_err(io(&replaced))?;
-    }
     if folder.exists() {
-        fs::rename(&folder, &replaced).map_err(io(&folder))?;
+        if replaced.exists() {
+            disk.remove_dir(&replaced).map_err(io(&replaced))?;
+        }
+        disk.rename(&folder, &replaced).map_err(io(&folder))?;
     }
-    fs::rename(&temporary, &folder).map_err(io(&folder))?;
-    if replaced.exists() {
-        fs::remove_dir_all(&replaced).map_err(io(&replaced))?;
-    }
-    // The rename itself must survive a power cut.
-    File::open(&parent).and_then(|d| d.sync_all()).map_err(io(&parent))?;
-    let surplus = list(run)?;
-    for old in surplus.iter().rev().skip(keep.max(1) as usize) {
-        fs::remove_dir_all(old).map_err(io(old))?;
+    disk.rename(&temporary, &folder).map_err(io(&folder))?;
+    // The renames must survive a power cut before anything older goes.
+    disk.sync(&parent).map_err(io(&parent))?;
+    let newest_first = list(run)?.into_iter().rev();
+    let surplus = std::iter::once(replaced).filter(|old| old.exists()).chain(newest_first.skip(keep.max(1) as usize));
+    for old in surplus {
+        if let Err(error) = disk.remove_dir(&old) {
+            // The checkpoint itself is there.
+            tracing::warn!(%error, path = %old.display(), "an old checkpoint cannot be removed");
+        }
     }
     Ok(folder)
 }
 
-fn write_file(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
-    let write = || -> std::io::Result<()> {
-        let mut file = File::create(path)?;
-        file.write_all(bytes)?;
-        file.sync_all()
+/// Everything that a checkpoint consists of, under its temporary name, safe from a power cut.
+fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
+    let io = |path: &Path| {
+        let path = path.to_owned();
+        move |error| CheckpointError::Io { path, error }
     };
-    write().map_err(|error| CheckpointError::Io { path: path.to_owned(), error })
+    let unwritable = |file: &str, error: serde_json::Error| CheckpointError::Corrupt {
+        path: folder.join(file),
+        reason: error.to_string(),
+    };
+    if folder.exists() {
+        disk.remove_dir(folder).map_err(io(folder))?;
+    }
+    disk.create_dir(folder).map_err(io(folder))?;
+    let state = serde_json::to_vec_pretty(progress).map_err(|e| unwritable("state.json", e))?;
+    let mut contents: Vec<(&str, Vec<u8>)> =
+        FILES.into_iter().zip([learned.weights()?, learned.moments()?, state]).collect();
+    let sha256 = contents.iter().map(|(file, bytes)| ((*file).to_owned(), sha256_hex(bytes))).collect();
+    let manifest = serde_json::to_vec_pretty(&Manifest { format: FORMAT, sha256 });
+    contents.push((MANIFEST, manifest.map_err(|e| unwritable(MANIFEST, e))?));
+    for (file, bytes) in contents {
+        let path = folder.join(file);
+        disk.write(&path, &bytes).map_err(io(&path))?;
+        disk.sync(&path).map_err(io(&path))?;
+    }
+    disk.sync(folder).map_err(io(folder))
+}
+
+/// Removes what a kill left of checkpoints that were being written. Nobody else may be writing.
+pub fn clean(run: &Path) {
+    let Ok(entries) = fs::read_dir(run.join("checkpoints")) else { return };
+    let unfinished = |path: &Path| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let digits = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp"));
+        digits.is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
+    };
+    for path in entries.filter_map(Result::ok).map(|entry| entry.path()).filter(|path| unfinished(path)) {
+        if let Err(error) = fs::remove_dir_all(&path) {
+            // It only takes room.
+            tracing::warn!(%error, path = %path.display(), "an unfinished checkpoint cannot be removed");
+        }
+    }
 }
 
 /// Checkpoint folders of a run, oldest first. Unfinished ones are not listed.
 pub fn list(run: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
     let parent = run.join("checkpoints");
     let Ok(entries) = fs::read_dir(&parent) else { return Ok(Vec::new()) };
-    let mut folders: Vec<PathBuf> = entries
-        .filter_map(Result::ok)
-        .map(|e| e.path())
-        .filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy().chars().all(|c| c.is_ascii_digit())))
-        .collect();
-    folders.sort_by_key(|p| p.file_name().and_then(|n| n.to_string_lossy().parse::<u64>().ok()));
-    Ok(folders)
+    let mut folders: Vec<(u64, bool, PathBuf)> =
+        entries.filter_map(Result::ok).filter_map(|entry| numbered(entry.path())).collect();
+    folders.sort_unstable();
+    // One that a kill left under its other name counts only as long as nothing is in its place.
+    let names: Vec<u64> = folders.iter().filter(|(.., in_place, _)| *in_place).map(|(number, ..)| *number).collect();
+    let counts = |(number, in_place, _): &(u64, bool, PathBuf)| *in_place || !names.contains(number);
+    Ok(folders.into_iter().filter(counts).map(|(.., path)| path).collect())
+}
+
+/// `000012` and `.000012.old`: the number, and whether the folder is in its place.
+fn numbered(path: PathBuf) -> Option<(u64, bool, PathBuf)> {
+    let name = path.file_name()?.to_str()?;
+    let replaced = name.strip_prefix('.').and_then(|name| name.strip_suffix(".old"));
+    let digits = replaced.unwrap_or(name);
+    let number = digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())??;
+    Some((number, replaced.is_none(), path))
 }
 
 /// Checks a checkpoint's hashes and reads it into networks laid out like `template`.
@@ -195,11 +273,19 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
     let load = |file: &str| {
         fs::read(folder.join(file)).map_err(|error| CheckpointError::Io { path: folder.join(file), error })
     };
-    let manifest: Manifest =
-        serde_json::from_slice(&load("manifest.json")?).map_err(|e| corrupt("manifest.json", e.to_string()))?;
-    if manifest.format > FORMAT {
-        return Err(corrupt("manifest.json", format!("format {} is newer than {FORMAT}", manifest.format)));
+    let bytes = load(MANIFEST)?;
+    // The format decides what else is in there.
+    let Format { format } = serde_json::from_slice(&bytes).map_err(|e| corrupt(MANIFEST, e.to_string()))?;
+    if format != FORMAT {
+        // A flipped bit looks like another format, but only in one of two places.
+        return match load("state.json").map(|state| serde_json::from_slice(&state)) {
+            Ok(Ok(Format { format: FORMAT })) => {
+                Err(corrupt(MANIFEST, format!("format {format} is not that of state.json")))
+            }
+            _ => Err(CheckpointError::Format { path: folder.to_owned(), format }),
+        };
     }
+    let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|e| corrupt(MANIFEST, e.to_string()))?;
     let mut contents = Vec::new();
     for file in FILES {
         let bytes = load(file)?;
@@ -227,7 +313,8 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
     Ok((progress, learned))
 }
 
-/// The newest checkpoint that can be read, and what was wrong with the newer ones.
+/// The newest checkpoint that can be read, and what was wrong with the newer ones. One of another format is not damage: what
+/// it holds is not given up for an older one.
 pub fn read_latest(
     run: &Path,
     template: &Learned,
@@ -236,13 +323,16 @@ pub fn read_latest(
     for folder in list(run)?.iter().rev() {
         match read(folder, template) {
             Ok((progress, learned)) => return Ok((progress, learned, skipped)),
+            Err(error @ CheckpointError::Format { .. }) => return Err(error),
             Err(error) => skipped.push(error),
         }
     }
-    match skipped.pop() {
-        Some(newest) if skipped.is_empty() => Err(newest),
-        _ => Err(CheckpointError::None(run.to_owned())),
-    }
+    let count = skipped.len();
+    Err(match skipped.into_iter().next() {
+        Some(newest) if count == 1 => newest,
+        Some(newest) => CheckpointError::Unusable { run: run.to_owned(), count, newest: Box::new(newest) },
+        None => CheckpointError::None(run.to_owned()),
+    })
 }
 
 #[cfg(test)]

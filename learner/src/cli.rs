@@ -1,17 +1,25 @@
 //! The learner's command line.
 
+use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::ingest::Limits;
+use crate::page::{LivePage, RunInfo};
 use crate::service::{LearnerHandle, RunIdentity, learner_service};
+use crate::standing::Standing;
 use crate::trainer::{Outcome, Trainer};
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
+use magex_proto::v1;
 use magex_runtime::backoff::incarnation;
 use magex_runtime::exit::{self, Failure};
-use magex_runtime::telemetry::{self, LogFormat};
+use magex_runtime::health::probe;
+use magex_runtime::http::{HttpArgs, Page};
+use magex_runtime::security::ServerArgs;
+use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
 use magex_runtime::{process, server, shutdown};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
@@ -43,25 +51,47 @@ pub struct LearnerArgs {
     /// Continue the run in that folder
     #[arg(long, env = "MAGEX_RESUME")]
     pub resume: bool,
+    /// Continue the run in that folder if there is one, begin it otherwise: for whatever starts the same command again
+    #[arg(long, env = "MAGEX_RESUME_OR_CREATE", conflicts_with = "resume")]
+    pub resume_or_create: bool,
+    /// Go on serving when the run is complete, until told to stop
+    #[arg(long, env = "MAGEX_LEARNER_STAY")]
+    pub stay: bool,
     /// Address to listen on; port 0 is any free one
     #[arg(long, env = "MAGEX_LEARNER_LISTEN", default_value = "127.0.0.1:7000", value_name = "HOST:PORT")]
     pub listen: String,
     /// An actor that says nothing for so long loses its leases
     #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS")]
     pub lease_seconds: f64,
+    /// How the port is guarded.
+    #[command(flatten)]
+    pub security: ServerArgs,
     /// Training threads [default: one per processor]
     #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
     pub threads: usize,
+    /// What operators look at
+    #[command(flatten)]
+    pub http: HttpArgs,
+    /// Where traces go
+    #[command(flatten)]
+    pub traces: TraceArgs,
     /// How log lines look
     #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
     /// Print the run's configuration in effect and exit
     #[arg(long)]
     pub print_config: bool,
+    /// Ask the learner that listens on --listen whether it serves, and exit: 0 it does, 1 it does not
+    #[arg(long)]
+    pub health_check: bool,
 }
 
 /// Trains until the run is complete or told to stop. The exit code, or why it failed.
-pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
+pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
+    if args.health_check {
+        return probe::own(&args.listen, args.security.tls_cert.is_some());
+    }
+    args.resume |= args.resume_or_create && Standing::of(&args.out) == Standing::Run;
     let config = configure(&args)?;
     let toml = config.to_toml().map_err(Failure::usage)?;
     if args.print_config {
@@ -72,17 +102,24 @@ pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
         .ok()
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
-    telemetry::init(args.log_format);
+    let security = args.security.read(&args.listen)?;
+    process::allow_open_files();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("magex-net")
         .enable_all()
         .build()
         .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    let telemetry = {
+        let _runtime = runtime.enter();
+        telemetry::init("magex-learner", args.log_format, &args.traces).map_err(Failure::usage)?
+    };
     // A port that cannot be had must not leave a run folder behind.
     let (incoming, address) =
         runtime.block_on(server::bind(&args.listen)).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-    let trainer = prepare(&args, &config, &toml)?;
+    let incoming = incoming.within(args.security.connections());
+    let page = runtime.block_on(args.http.bind()).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
+    let mut trainer = prepare(&args, &config, &toml)?;
     let identity = RunIdentity {
         run_id: trainer.run_id().clone(),
         name: args.out.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
@@ -92,13 +129,21 @@ pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
         lease,
     };
     let most = (config.mappo.episodes / config.mappo.shards).max(EVAL_SHARD_LIMIT);
+    let live = RunInfo { name: identity.name.clone(), learner: Some(address.to_string()), lease: Some(lease) };
     let (handle, mut collector) = learner_service(identity, Limits::for_task(&config.task, most as usize));
+    let handle = handle.guarded(security);
     let end = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        process::announce_ready("learner", Some(address));
-        let serving = tokio::spawn(serve(handle, incoming, stop.clone()));
+        process::announce_ready("learner", Some(address), page.as_ref().map(Page::address));
+        let showing = page.map(|page| {
+            let live = Arc::new(LivePage::new(&config, live));
+            trainer.show(live.clone());
+            let status = handle.clone();
+            let routes = handle.routes().merge(live.routes(move || Some(status.status())));
+            (live, page.serve(routes, stop.clone()))
+        });
+        let serving = tokio::spawn(serve(handle.clone(), incoming, stop.clone()));
         let (ended, training_end) = tokio::sync::oneshot::channel();
-        let mut trainer = trainer;
         std::thread::Builder::new()
             .name("magex-train".to_owned())
             .stack_size(TRAINER_STACK)
@@ -111,30 +156,60 @@ pub fn run(args: LearnerArgs) -> Result<u8, Failure> {
             outcome = training_end => Some(outcome),
             () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
         };
+        if args.stay && matches!(outcome, Some(Ok(Ok(Outcome::Finished(_))))) {
+            tracing::info!("the run is complete; serving its weights until told to stop");
+            tokio::select! {
+                () = stop.cancelled() => {}
+                () = handle.told() => {}
+            }
+        } else if let Some((live, _)) = showing.as_ref().filter(|_| !stop.is_cancelled()) {
+            live.farewell().await;
+        }
         // Tells the actors, ends the streams, closes the port.
         stop.cancel();
         serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
+        if let Some((_, showing)) = showing {
+            // Ends with the server at the latest, which has the same grace.
+            let _ = showing.await;
+        }
+        log_ledger(&handle.status());
         match outcome {
             Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
             Some(Err(_)) => Err(Failure::new(exit::INTERNAL, "the training thread died")),
             None => Ok(None),
         }
     });
+    telemetry.flush();
     runtime.shutdown_background();
     let reason = match end? {
         Some(Outcome::Finished(_)) => return Ok(exit::OK),
         Some(Outcome::Stopped(reason)) => reason.to_string(),
         None => "the iteration did not end in time; its last checkpoint stands".to_owned(),
     };
-    tracing::info!(reason, "stopped; continue with --resume --out {}", args.out.display());
+    tracing::info!(reason, out = %args.out.display(), "stopped; continue with --resume");
     Ok(exit::TEMPORARY)
 }
 
-async fn serve(
-    handle: LearnerHandle,
-    incoming: tonic::transport::server::TcpIncoming,
-    stop: CancellationToken,
-) -> Result<(), Failure> {
+/// What became of everything that was leased.
+fn log_ledger(status: &v1::RunStatus) {
+    for (counted, books) in [("shards", &status.ledger), ("episodes", &status.episodes)] {
+        let Some(b) = books else { continue };
+        tracing::info!(
+            counted,
+            leased = b.leased,
+            trained = b.trained,
+            duplicate = b.duplicate,
+            expired = b.expired,
+            rejected = b.rejected,
+            failed = b.failed,
+            outstanding = b.outstanding,
+            residual = b.residual,
+            "ledger"
+        );
+    }
+}
+
+async fn serve(handle: LearnerHandle, incoming: server::Incoming, stop: CancellationToken) -> Result<(), Failure> {
     handle.serve(incoming, stop).await.map_err(|error| Failure::new(exit::INTERNAL, error))
 }
 
@@ -164,21 +239,29 @@ fn prepare(args: &LearnerArgs, config: &RunConfig, toml: &str) -> Result<Trainer
     if args.resume {
         let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads).map_err(|error| failed(&error))?;
         for problem in skipped {
-            tracing::warn!(%problem, "skipped a checkpoint");
+            tracing::warn!(error = %problem, "skipped a checkpoint");
         }
         return Ok(trainer);
     }
-    create_folder(&args.out, toml)?;
+    create_folder(&args.out, toml, args.resume_or_create)?;
     let run_id = RunId(format!("{:016x}", incarnation()));
     Trainer::create(config, run_id, &args.out, args.threads).map_err(|error| failed(&error))
 }
 
-/// A new run never touches the folder of another.
-fn create_folder(out: &Path, toml: &str) -> Result<(), Failure> {
+/// A new run never touches the folder of another. What a learner left that died before its first checkpoint may be begun
+/// again where that was asked for.
+fn create_folder(out: &Path, toml: &str, again: bool) -> Result<(), Failure> {
     let named = |error: &dyn Display| Failure::new(exit::CANNOT_CREATE, format!("{}: {error}", out.display()));
-    if std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some()) {
-        return Err(named(&"there is something already; continue a run with --resume, or choose another --out"));
+    match Standing::of(out) {
+        Standing::Empty => {}
+        Standing::Begun if again => tracing::info!("nothing was trained here yet; beginning again"),
+        Standing::Other if again => {
+            return Err(named(
+                &"there is something that is no run, or a run without checkpoints; choose another --out",
+            ));
+        }
+        _ => return Err(named(&"there is something already; continue a run with --resume, or choose another --out")),
     }
     std::fs::create_dir_all(out).map_err(|error| named(&error))?;
-    std::fs::write(out.join(CONFIG_FILE), toml).map_err(|error| named(&error))
+    replace_file(&mut FileSystem, out, CONFIG_FILE, toml.as_bytes()).map_err(|error| named(&error))
 }

@@ -1,13 +1,17 @@
 //! The trainer's view of the actors: publish weights, hand out a plan, get its results.
 
+use crate::bound::Collected;
 use crate::ingest::describe;
 use crate::ledger::PlanError;
-use crate::state::Shared;
+use crate::metrics::IterationMetrics;
+use crate::state::{Shared, lock};
 use crate::weights::Weights;
-use magex_core::ids::{Iteration, Shard, WeightsVersion};
+use magex_core::ids::{Iteration, Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::ShardResult;
 use std::fmt;
+use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// Gets plans done. Called from the training thread, which it blocks.
 pub trait Collector: Send {
@@ -27,6 +31,20 @@ pub trait Collector: Send {
     fn checkpoint_requested(&mut self) -> bool {
         false
     }
+
+    /// Where the time of the last plan's shards went; `None` if there is no network that it could have gone to.
+    fn collected(&self) -> Option<Collected> {
+        None
+    }
+
+    /// Takes note of how the run stood when it was resumed.
+    fn resumed(&mut self, _before: &IterationReport) {}
+
+    /// Takes note of what an iteration was like, for whoever operates the run.
+    fn measured(&mut self, _metrics: &IterationMetrics) {}
+
+    /// Takes note of a checkpoint that was written to this folder, or could not be.
+    fn checkpointed(&mut self, _took: Duration, _written: Option<&Path>) {}
 }
 
 /// Why the learner stops before the end of the run.
@@ -97,7 +115,7 @@ pub enum RunEvent {
 /// What an iteration was like.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IterationReport {
-    /// Which.
+    /// Iterations completed.
     pub iteration: Iteration,
     /// Joint steps trained on so far.
     pub joint_env_steps: u64,
@@ -109,15 +127,30 @@ pub struct IterationReport {
     pub metrics_json: String,
 }
 
+impl IterationReport {
+    /// What a line of metrics.jsonl says; `None` if it is not one.
+    pub(crate) fn of(line: String) -> Option<Self> {
+        let metrics: serde_json::Value = serde_json::from_str(&line).ok()?;
+        Some(Self {
+            iteration: Iteration(u32::try_from(metrics["iteration"].as_u64()?).ok()?),
+            joint_env_steps: metrics["joint_env_steps"].as_u64()?,
+            success: metrics["success_rate"].as_f64().map(|x| x as f32),
+            reward: metrics["reward"].as_f64().map(|x| x as f32),
+            metrics_json: line,
+        })
+    }
+}
+
 /// The collector whose actors connect over gRPC. Made by [`crate::service::learner_service`].
 #[derive(Debug)]
 pub struct GrpcCollector {
     shared: Arc<Shared>,
+    collected: Collected,
 }
 
 impl GrpcCollector {
     pub(crate) fn new(shared: Arc<Shared>) -> Self {
-        Self { shared }
+        Self { shared, collected: Collected::default() }
     }
 
     /// Hands out a plan and returns at once; actors that wait for work get it now.
@@ -131,7 +164,14 @@ impl GrpcCollector {
 
     /// Blocks until the open plan is done.
     pub fn wait(&mut self) -> Result<Vec<ShardResult>, CollectError> {
-        self.shared.wait()
+        let results = self.shared.wait()?;
+        let (collected, ages) = lock(&self.shared.tally).close(Instant::now());
+        self.collected = collected;
+        let newest = self.shared.board.latest().map_or(0, |weights| weights.version.0);
+        let training = results.iter().map(ShardResult::shard).filter(|shard| shard.kind == ShardKind::Train);
+        let lags: Vec<f64> = training.map(|shard| f64::from(newest.saturating_sub(shard.version.0))).collect();
+        self.shared.gauges.batch(&lags, &ages);
+        Ok(results)
     }
 }
 
@@ -154,6 +194,10 @@ impl Collector for GrpcCollector {
         self.shared.record(event);
     }
 
+    fn resumed(&mut self, before: &IterationReport) {
+        self.shared.reported(before);
+    }
+
     fn stop_requested(&self) -> Option<StopReason> {
         self.shared.stop_requested()
     }
@@ -161,4 +205,35 @@ impl Collector for GrpcCollector {
     fn checkpoint_requested(&mut self) -> bool {
         self.shared.take_checkpoint_request()
     }
+
+    fn collected(&self) -> Option<Collected> {
+        Some(self.collected)
+    }
+
+    fn measured(&mut self, metrics: &IterationMetrics) {
+        self.shared.gauges.iteration(metrics);
+        let (bound, timing) = (&metrics.timing.bound, &metrics.timing);
+        tracing::info!(
+            iteration = metrics.iteration,
+            joint_env_steps = metrics.joint_env_steps,
+            success_rate = metrics.success_rate,
+            reward = metrics.reward,
+            bound_by = bound.by.name(),
+            actor_s = bound.actor_s,
+            learner_s = bound.learner_s,
+            network_s = bound.network_s,
+            collect_s = timing.collect_s,
+            "iteration"
+        );
+    }
+
+    fn checkpointed(&mut self, took: Duration, written: Option<&Path>) {
+        self.shared.gauges.checkpoint(took, written.map(size_of));
+    }
+}
+
+/// Bytes of the files in a folder.
+fn size_of(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+    entries.filter_map(|entry| entry.metadata().ok()).map(|meta| meta.len()).sum()
 }

@@ -4,6 +4,10 @@
 //! The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic is needed. The
 //! surrogate is clipped pick by pick: the ratio of a whole 50-agent decision would leave the clip range at once.
 
+mod imitation;
+#[cfg(test)]
+mod tests;
+
 use crate::adam::Adam;
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::CommanderConfig;
@@ -14,6 +18,8 @@ use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
 use magex_nets::ops::Pick;
 use magex_nets::params::Params;
+
+pub use imitation::Lesson;
 
 /// Everything that learning changes.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,6 +52,8 @@ pub struct CommanderStats {
     pub greedy_cost_ratio: f64,
     /// max over episodes of |Δ log-probability of the whole decision| / picks between commander and learner.
     pub first_ratio_error: f64,
+    /// Decisions and minibatches left out because an advantage, a loss or a gradient was not finite.
+    pub skipped: f64,
 }
 
 /// The algorithm with its settings.
@@ -84,7 +92,7 @@ impl CommanderPpo {
         let commander =
             Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(state.params.plain()?))?;
         let mut samples = Vec::new();
-        let (mut ratio_sum, mut error) = (0.0, 0.0f64);
+        let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
         for t in trajectories {
             let stages = self.stages.len();
             for b in 0..t.shape.episodes {
@@ -106,6 +114,11 @@ impl CommanderPpo {
                     let greedy = greedy_cost(&commander, &instance, &team)?;
                     let exact = f64::from(t.exact_costs[at]).max(1e-9);
                     let advantage = (greedy - f64::from(t.costs[at])) / exact;
+                    if !(advantage as f32).is_finite() {
+                        // It would spoil the scale of all others.
+                        skipped += 1.0;
+                        continue;
+                    }
                     ratio_sum += greedy / exact;
                     let log_probs =
                         commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
@@ -116,11 +129,12 @@ impl CommanderPpo {
             }
         }
         if samples.is_empty() {
-            return Ok(CommanderStats::default());
+            return Ok(CommanderStats { skipped, ..CommanderStats::default() });
         }
         let mut stats = self.improve(state, &samples, iteration, progress_rate)?;
         stats.greedy_cost_ratio = ratio_sum / samples.len().max(1) as f64;
         stats.first_ratio_error = error;
+        stats.skipped += skipped;
         Ok(stats)
     }
 
@@ -163,30 +177,45 @@ impl CommanderPpo {
                 let mean = |x: Tensor| -> candle_core::Result<Tensor> { x.sum_all()?.affine(1.0 / rows as f64, 0.0) };
                 let (surrogate, entropy) = (mean(surrogate)?, mean(now.get(1)?)?);
                 let loss = (surrogate.neg()? - (&entropy * f64::from(c.entropy))?)?;
-                let gradients = loss.backward()?;
-                let mut flat = Vec::with_capacity(state.params.numbers.len());
-                for variable in &variables {
-                    let gradient = match gradients.get(variable) {
-                        Some(gradient) => gradient.clone(),
-                        None => Tensor::zeros(variable.shape(), DType::F32, &Device::Cpu)?,
-                    };
-                    flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
+                let (surrogate, entropy) = (surrogate.to_scalar::<f32>()?, entropy.to_scalar::<f32>()?);
+                // Adam takes no step along a gradient that is not finite.
+                let usable = surrogate.is_finite()
+                    && entropy.is_finite()
+                    && self.descend(state, &variables, &loss, progress_rate)?.is_finite();
+                if !usable {
+                    stats.skipped += 1.0;
+                    continue;
                 }
-                stats.loss -= f64::from(surrogate.to_scalar::<f32>()?);
-                stats.entropy += f64::from(entropy.to_scalar::<f32>()?);
+                stats.loss -= f64::from(surrogate);
+                stats.entropy += f64::from(entropy);
                 count += 1.0;
-                state.adam.step(
-                    &mut state.params.numbers,
-                    &flat,
-                    c.learning_rate * progress_rate,
-                    1e-5,
-                    c.max_grad_norm.into(),
-                );
             }
         }
         stats.loss /= f64::max(count, 1.0);
         stats.entropy /= f64::max(count, 1.0);
         Ok(stats)
+    }
+
+    /// One step of Adam down the gradient of a loss. The gradient's norm.
+    fn descend(
+        &self,
+        state: &mut CommanderState,
+        variables: &[Var],
+        loss: &Tensor,
+        progress_rate: f64,
+    ) -> Result<f64, CommanderError> {
+        let gradients = loss.backward()?;
+        let mut flat = Vec::with_capacity(state.params.numbers.len());
+        for variable in variables {
+            let gradient = match gradients.get(variable) {
+                Some(gradient) => gradient.clone(),
+                None => Tensor::zeros(variable.shape(), DType::F32, &Device::Cpu)?,
+            };
+            flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
+        }
+        let c = &self.config;
+        let (rate, max_norm) = (c.learning_rate * progress_rate, c.max_grad_norm.into());
+        Ok(state.adam.step(&mut state.params.numbers, &flat, rate, 1e-5, max_norm))
     }
 
     /// Log-probabilities of every pick under the present weights.
@@ -237,12 +266,13 @@ pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) 
     Ok(cost(team, &instance.decide(&scores, None).0.goals))
 }
 
-/// C: summed distance of an assignment, in double precision.
+/// C: summed distance of an assignment, in double precision; agents without a goal cost nothing.
 pub fn cost(team: &Team<'_>, goals: &[u32]) -> f64 {
     let d = team.dims;
     goals
         .iter()
         .enumerate()
+        .filter(|(_, goal)| **goal != u32::MAX)
         .map(|(agent, &goal)| {
             let square: f64 = (0..d)
                 .map(|k| {

@@ -5,12 +5,14 @@ use crate::state::lock;
 use magex_proto::v1;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// Events that are kept for late watchers.
-const KEPT: usize = 10_000;
+/// Events that are kept for late watchers. A line of metrics is some kilobytes: more would be a slow leak for the first hours
+/// of a run; metrics.jsonl has them all.
+const KEPT: usize = 1000;
 
 /// Events that are copied at a time, so that the log is never locked for long.
 const BATCH: usize = 256;
@@ -47,6 +49,11 @@ impl Events {
         self.count.send_replace(count);
     }
 
+    /// Events that are kept.
+    pub(crate) fn len(&self) -> usize {
+        lock(&self.log).events.len()
+    }
+
     /// Events from number `from` on, some at a time, with the number of the first.
     fn since(&self, from: u64) -> (u64, Vec<Arc<RunEvent>>) {
         let log = lock(&self.log);
@@ -55,11 +62,13 @@ impl Events {
         (start, log.events.iter().skip(skip).take(BATCH).cloned().collect())
     }
 
-    /// Sends all kept events and follows; ends after the end of the run, when the learner closes, or with the reader.
+    /// Sends all kept events and follows; ends after the end of the run, when the learner closes, or with the reader, who has
+    /// left if nothing is taken for as long as `patience`.
     pub(crate) async fn stream(
         self: Arc<Self>,
         reader: mpsc::Sender<Result<v1::WatchRunResponse, Status>>,
         closing: CancellationToken,
+        patience: Duration,
     ) {
         let mut count = self.count.subscribe();
         let mut next = 0;
@@ -79,8 +88,13 @@ impl Events {
             for event in events {
                 let finished = matches!(*event, RunEvent::Finished { .. });
                 let message = v1::WatchRunResponse { sequence: next, event: Some(to_message(&event)) };
-                if reader.send(Ok(message)).await.is_err() || finished {
-                    return;
+                match reader.send_timeout(Ok(message), patience).await {
+                    Ok(()) if !finished => {}
+                    Ok(()) | Err(mpsc::error::SendTimeoutError::Closed(_)) => return,
+                    Err(mpsc::error::SendTimeoutError::Timeout(_)) => {
+                        tracing::warn!(?patience, "a watcher of the run reads nothing; its stream ends");
+                        return;
+                    }
                 }
                 next += 1;
             }
@@ -119,7 +133,7 @@ mod tests {
             events.push(RunEvent::Log(i.to_string()));
         }
         let (tx, mut rx) = mpsc::channel(4);
-        tokio::spawn(events.clone().stream(tx, CancellationToken::new()));
+        tokio::spawn(events.clone().stream(tx, CancellationToken::new(), Duration::from_secs(60)));
         for i in 5..KEPT + 5 {
             let got = rx.recv().await.unwrap().unwrap();
             assert_eq!(got.sequence, i as u64);
@@ -127,6 +141,18 @@ mod tests {
         }
         events.push(RunEvent::Finished { summary_json: "{}".into() });
         assert!(matches!(rx.recv().await.unwrap().unwrap().event, Some(v1::watch_run_response::Event::Finished(_))));
+        assert!(rx.recv().await.is_none());
+    }
+
+    #[tokio::test]
+    async fn a_watcher_that_takes_nothing_is_let_go_of() {
+        let events = Arc::new(Events::new());
+        (0..9).for_each(|i| events.push(RunEvent::Log(i.to_string())));
+        let (tx, mut rx) = mpsc::channel(4);
+        events.stream(tx, CancellationToken::new(), Duration::from_millis(20)).await;
+        for i in 0..4 {
+            assert_eq!(rx.recv().await.unwrap().unwrap().sequence, i);
+        }
         assert!(rx.recv().await.is_none());
     }
 }

@@ -51,7 +51,7 @@ impl ValueNorm {
         Self { enabled, mean: 0.0, square: 0.0, debias: 0.0 }
     }
 
-    /// Takes in one minibatch of returns (raw units).
+    /// Takes in one minibatch of returns (raw units), unless one of them is not finite: it would never leave the statistics.
     pub fn update(&mut self, returns: impl Iterator<Item = f32>) {
         let (mut sum, mut square, mut count) = (0.0f64, 0.0f64, 0.0f64);
         for r in returns {
@@ -60,7 +60,7 @@ impl ValueNorm {
             square += r * r;
             count += 1.0;
         }
-        if count > 0.0 {
+        if count > 0.0 && sum.is_finite() && square.is_finite() {
             self.mean = Self::BETA * self.mean + (1.0 - Self::BETA) * sum / count;
             self.square = Self::BETA * self.square + (1.0 - Self::BETA) * square / count;
             self.debias = Self::BETA * self.debias + (1.0 - Self::BETA);
@@ -106,6 +106,17 @@ mod tests {
         }
         let expected = 1.0 + 0.9 * 2.0 + 0.81 * 3.0 + 0.729 * 4.0;
         assert!((r[0] - expected).abs() < 1e-5 && (r[1] - 10.0 * expected).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_return_that_is_not_finite_does_not_reach_the_statistics() {
+        let mut norm = ValueNorm::new(true);
+        norm.update([1.0, 3.0].into_iter());
+        let before = norm;
+        for bad in [f32::NAN, f32::INFINITY] {
+            norm.update([1.0, bad].into_iter());
+            assert_eq!(norm, before);
+        }
     }
 
     #[test]

@@ -15,6 +15,8 @@ pub struct Limits {
     pub action_heads: Vec<usize>,
     /// Actors connected at the same time.
     pub max_actors: usize,
+    /// Open streams of weights and of events, at the same time.
+    pub max_watchers: usize,
 }
 
 impl Limits {
@@ -22,7 +24,7 @@ impl Limits {
     pub fn for_task(task: &TaskConfig, max_episodes: usize) -> Self {
         let action_heads = task.action_heads();
         let shape = task.shape(max_episodes);
-        Self { shape, action_heads, max_actors: 256 }
+        Self { shape, action_heads, max_actors: 256, max_watchers: 1024 }
     }
 
     /// Longest encoded result, bytes: its arrays, and a generous envelope.

@@ -1,14 +1,14 @@
 //! Who works on what, and what became of it: a pure state machine without clock, threads or network.
 //!
 //! The learner opens a plan (the shards of an iteration); actors lease shards and complete them in any order and any number
-//! of times; the results come out in the order of the plan, each exactly once. Every lease ends in exactly one way:
-//! leased = trained + duplicate + expired + rejected + failed + outstanding.
+//! of times; the results come out in the order of the plan, each exactly once. Every lease ends in exactly one way, and so
+//! do the episodes of its shard: leased = trained + duplicate + expired + rejected + failed + outstanding.
 
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 
-/// Attempts after which a shard that fails for good (not retryable) is given up, and with it the run.
+/// Failures for good (not retryable) before which no shard is given up, and no actor is sent away for them.
 pub const MAX_FAILURES: u32 = 3;
 
 /// One connection of one actor.
@@ -39,7 +39,7 @@ pub enum Verdict {
     Rejected(String),
 }
 
-/// What became of every lease so far.
+/// What became of everything that was leased so far: of the shards, or of their episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Handed out, late results of forgotten leases included.
@@ -59,10 +59,49 @@ pub struct Counters {
 }
 
 impl Counters {
-    /// Leases that ended in no way or in two: always zero.
+    /// What ended in no way or in two: always zero.
     pub fn residual(&self) -> i128 {
         let ended = [self.trained, self.duplicate, self.expired, self.rejected, self.failed, self.outstanding];
         i128::from(self.leased) - ended.into_iter().map(i128::from).sum::<i128>()
+    }
+
+    fn of(&mut self, fate: Fate) -> &mut u64 {
+        match fate {
+            Fate::Trained => &mut self.trained,
+            Fate::Duplicate => &mut self.duplicate,
+            Fate::Expired => &mut self.expired,
+            Fate::Rejected => &mut self.rejected,
+            Fate::Failed => &mut self.failed,
+        }
+    }
+}
+
+/// How a lease ends.
+#[derive(Debug, Clone, Copy)]
+enum Fate {
+    Trained,
+    Duplicate,
+    Expired,
+    Rejected,
+    Failed,
+}
+
+/// Shards and episodes, counted together so that neither can be forgotten.
+#[derive(Debug, Default)]
+struct Books {
+    shards: Counters,
+    episodes: Counters,
+}
+
+impl Books {
+    fn leased(&mut self, episodes: u32) {
+        self.shards.leased += 1;
+        self.episodes.leased += u64::from(episodes);
+    }
+
+    fn ended(&mut self, fate: Fate, episodes: u32) {
+        *self.shards.of(fate) += 1;
+        *self.episodes.of(fate) += u64::from(episodes);
     }
 }
 
@@ -94,6 +133,19 @@ pub struct GivenUp {
     pub reason: String,
 }
 
+/// A failure for good: the actor says that it would meet it again.
+#[derive(Debug, Clone, Copy)]
+pub struct Failure<'a> {
+    /// Name of the actor.
+    pub actor: &'a str,
+    /// Number of its process.
+    pub process: u64,
+    /// What it said.
+    pub reason: &'a str,
+    /// The processes of all actors that are connected.
+    pub present: &'a [u64],
+}
+
 #[derive(Debug)]
 struct Slot {
     shard: Shard,
@@ -101,6 +153,23 @@ struct Slot {
     queued: bool,
     leases: u32,
     failures: u32,
+    /// Processes and names of the actors at which it failed for good.
+    failed_at: Vec<(u64, String)>,
+}
+
+impl Slot {
+    /// Notes a failure for good; whether it is the shard that is to blame. One actor's failures say nothing: as many
+    /// different ones must have met them, or everyone who is there. A process that is started anew under its old name is
+    /// the same actor.
+    fn fail(&mut self, failure: &Failure<'_>) -> bool {
+        let Failure { actor, process, present, .. } = *failure;
+        self.failures = self.failures.saturating_add(1);
+        self.failed_at.retain(|(other, name)| *other != process && (name != actor || present.contains(other)));
+        self.failed_at.push((process, actor.to_owned()));
+        let actors: BTreeSet<&str> = self.failed_at.iter().map(|(_, name)| name.as_str()).collect();
+        let everyone = present.iter().all(|here| self.failed_at.iter().any(|(process, _)| process == here));
+        actors.len() >= MAX_FAILURES as usize || (everyone && self.failures >= MAX_FAILURES)
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -118,7 +187,7 @@ pub struct Ledger {
     queue: VecDeque<usize>,
     held: BTreeMap<LeaseId, Held>,
     done: usize,
-    counters: Counters,
+    books: Books,
     given_up: Option<GivenUp>,
 }
 
@@ -132,7 +201,7 @@ impl Ledger {
             queue: VecDeque::new(),
             held: BTreeMap::new(),
             done: 0,
-            counters: Counters::default(),
+            books: Books::default(),
             given_up: None,
         }
     }
@@ -153,7 +222,7 @@ impl Ledger {
         }
         self.queue = (0..plan.len()).collect();
         self.position = position;
-        let slot = |shard| Slot { shard, result: None, queued: true, leases: 0, failures: 0 };
+        let slot = |shard| Slot { shard, result: None, queued: true, leases: 0, failures: 0, failed_at: Vec::new() };
         self.plan = plan.into_iter().map(slot).collect();
         self.done = 0;
         self.given_up = None;
@@ -173,7 +242,7 @@ impl Ledger {
             let id = LeaseId(self.next_lease);
             self.next_lease = self.next_lease.wrapping_add(1);
             self.held.insert(id, Held { session, shard: slot.shard });
-            self.counters.leased += 1;
+            self.books.leased(slot.shard.episodes);
             return Some(Lease { id, shard: slot.shard });
         }
     }
@@ -187,17 +256,17 @@ impl Ledger {
             return Verdict::Rejected("shard: not the one that was leased".to_owned());
         }
         if self.release(session, lease).is_none() {
-            self.counters.leased += 1;
+            self.books.leased(shard.episodes);
         }
         match self.position.get(&shard).map(|&at| &mut self.plan[at]) {
             Some(slot) if slot.result.is_none() => {
                 slot.result = Some(result);
                 self.done += 1;
-                self.counters.trained += 1;
+                self.books.ended(Fate::Trained, shard.episodes);
                 Verdict::Accepted
             }
             _ => {
-                self.counters.duplicate += 1;
+                self.books.ended(Fate::Duplicate, shard.episodes);
                 Verdict::Duplicate
             }
         }
@@ -205,25 +274,40 @@ impl Ledger {
 
     /// Notes that the result of a lease was not usable; the shard is to be done again, next.
     pub fn reject(&mut self, session: SessionId, lease: LeaseId) {
-        match self.release(session, lease) {
-            Some(held) => self.requeue(held.shard, true),
-            None => self.counters.leased += 1,
-        }
-        self.counters.rejected += 1;
+        // Of a lease that is held no more nobody knows how many episodes it had: it has none.
+        let episodes = match self.release(session, lease) {
+            Some(held) => {
+                self.requeue(held.shard, true);
+                held.shard.episodes
+            }
+            None => {
+                self.books.leased(0);
+                0
+            }
+        };
+        self.books.ended(Fate::Rejected, episodes);
     }
 
-    /// Takes a lease back from an actor that cannot do it. A shard that fails for good [`MAX_FAILURES`] times is given up.
-    pub fn fail(&mut self, session: SessionId, lease: LeaseId, reason: &str, retryable: bool) {
-        let Some(held) = self.release(session, lease) else { return };
-        self.counters.failed += 1;
-        if !retryable && let Some(&at) = self.position.get(&held.shard) {
+    /// Takes a lease back from an actor that cannot do it now; it comes after the others.
+    pub fn give_back(&mut self, session: SessionId, lease: LeaseId) {
+        if let Some(held) = self.release(session, lease) {
+            self.books.ended(Fate::Failed, held.shard.episodes);
+            self.requeue(held.shard, false);
+        }
+    }
+
+    /// Takes a lease back from an actor that could never do it; whether the actor held it. The shard is given up once it
+    /// failed so at [`MAX_FAILURES`] different actors, or that often and at every actor that is there.
+    pub fn fail(&mut self, session: SessionId, lease: LeaseId, failure: &Failure<'_>) -> bool {
+        let Some(shard) = self.held_by(session, lease).map(|held| held.shard) else { return false };
+        if let Some(&at) = self.position.get(&shard) {
             let slot = &mut self.plan[at];
-            slot.failures += 1;
-            if slot.failures >= MAX_FAILURES && slot.result.is_none() {
-                self.given_up = Some(GivenUp { shard: held.shard, reason: reason.to_owned() });
+            if slot.fail(failure) && slot.result.is_none() {
+                self.given_up = Some(GivenUp { shard, reason: failure.reason.to_owned() });
             }
         }
-        self.requeue(held.shard, false);
+        self.give_back(session, lease);
+        true
     }
 
     /// Takes back all leases of an actor that left or fell silent; they are the next to be handed out. How many there were.
@@ -233,10 +317,10 @@ impl Ledger {
         // From the last to the first, so that the first is in front.
         for &lease in of_it.iter().rev() {
             if let Some(held) = self.release(session, lease) {
+                self.books.ended(Fate::Expired, held.shard.episodes);
                 self.requeue(held.shard, true);
             }
         }
-        self.counters.expired += of_it.len() as u64;
         of_it.len()
     }
 
@@ -288,7 +372,13 @@ impl Ledger {
 
     /// What became of every lease so far.
     pub fn counters(&self) -> Counters {
-        Counters { outstanding: self.held.len() as u64, ..self.counters }
+        Counters { outstanding: self.held.len() as u64, ..self.books.shards }
+    }
+
+    /// What became of the episodes of every lease so far.
+    pub fn episodes(&self) -> Counters {
+        let outstanding = self.held.values().map(|held| u64::from(held.shard.episodes)).sum();
+        Counters { outstanding, ..self.books.episodes }
     }
 
     fn held_by(&self, session: SessionId, lease: LeaseId) -> Option<&Held> {

@@ -53,7 +53,7 @@ pub struct UpdateStats {
     pub actor_grad_norm: f64,
     /// Norm of the critic's gradient before clipping.
     pub critic_grad_norm: f64,
-    /// Minibatches left out because a gradient was not finite.
+    /// Minibatches left out because a loss or a gradient was not finite.
     pub skipped: f64,
 }
 
@@ -211,7 +211,14 @@ impl Mappo {
                 let actor_gradient = sum_in_order(actor_results);
                 let critic_gradient = sum_in_order(critic_results);
 
-                // 6. Clip by global norm, step. A gradient that is not finite changes nothing.
+                // 6. Clip by global norm, step. Where a loss is not finite neither network moves, and where a gradient is not, not
+                // its own; the value statistics have taken the minibatch in by then.
+                let sum = |f: fn(&PolicyStats) -> f64| actor_results.iter().map(|r| f(&r.1)).sum::<f64>();
+                let value_sum = critic_results.iter().map(|r| r.2).sum::<f64>();
+                if !(sum(|s| s.loss).is_finite() && value_sum.is_finite()) {
+                    stats.skipped += 1.0;
+                    continue;
+                }
                 let actor_norm = state.actor_adam.step(
                     &mut state.actor.numbers,
                     &actor_gradient,
@@ -232,13 +239,12 @@ impl Mappo {
                     stats.skipped += 1.0;
                     continue;
                 }
-                let sum = |f: fn(&PolicyStats) -> f64| actor_results.iter().map(|r| f(&r.1)).sum::<f64>();
                 let samples = f64::from(samples);
                 stats.policy_loss += sum(|s| s.loss) / samples;
                 stats.entropy += sum(|s| s.entropy) / samples;
                 stats.clip_fraction += sum(|s| s.clipped) / samples;
                 stats.divergence += sum(|s| s.divergence) / samples;
-                stats.value_loss += critic_results.iter().map(|r| r.2).sum::<f64>() / samples;
+                stats.value_loss += value_sum / samples;
                 stats.actor_grad_norm += actor_norm;
                 stats.critic_grad_norm += critic_norm;
                 if epoch == 0 && index == 0 {

@@ -1,13 +1,16 @@
 //! What a run writes down: one line per iteration in metrics.jsonl, and summary.json at its end. docs/metrics.md lists
 //! every field.
 
+use crate::bound::{Bound, Collected, judge};
 use crate::checkpoint::Progress;
+use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::commander::CommanderStats;
 use crate::mappo::UpdateStats;
 use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::EpisodeMetrics;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -69,6 +72,8 @@ pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> 
 /// Where an iteration's wall time went, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Timing {
+    /// Making the weights known.
+    pub publish_s: f64,
     /// Waiting for the actors.
     pub collect_s: f64,
     /// Updating the executor.
@@ -77,6 +82,20 @@ pub struct Timing {
     pub commander_s: f64,
     /// Writing checkpoints.
     pub checkpoint_s: f64,
+    /// What the iteration waited for.
+    pub bound: Bound,
+}
+
+impl Timing {
+    /// With the verdict on what it was spent on.
+    pub fn judged(self, collected: Option<&Collected>) -> Self {
+        let learner_s = self.publish_s + self.executor_s + self.commander_s + self.checkpoint_s;
+        Self { bound: judge(learner_s, self.collect_s, collected), ..self }
+    }
+
+    fn seconds(&self) -> f64 {
+        self.publish_s + self.collect_s + self.executor_s + self.commander_s + self.checkpoint_s
+    }
 }
 
 /// One line of metrics.jsonl. Fields of an evaluation are null on iterations without one; fields of training are null on
@@ -140,7 +159,7 @@ impl IterationMetrics {
         updates: Option<(UpdateStats, CommanderStats)>,
         wall_s: f64,
     ) -> Self {
-        let seconds = timing.collect_s + timing.executor_s + timing.commander_s + timing.checkpoint_s;
+        let seconds = timing.seconds();
         let eval = |f: fn(&EvalSummary) -> f64| evaluation.as_ref().map(f);
         let train = |f: fn(&EvalSummary) -> f64| training.as_ref().map(f);
         let steps = if training.is_some() { config.steps_per_iteration() as f64 } else { 0.0 };
@@ -172,7 +191,7 @@ impl IterationMetrics {
 }
 
 /// What a finished run achieved: the evaluation that closes it, on spawns never seen before.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// Greedy: share of landmarks covered at the last step.
     pub success_rate: f64,
@@ -227,6 +246,7 @@ impl Summary {
         progress: &Progress,
         greedy: &EvalSummary,
         sampled: &EvalSummary,
+        target_reached: bool,
         wall_s: f64,
         weights_sha256: String,
     ) -> Self {
@@ -246,7 +266,7 @@ impl Summary {
             wall_s,
             iterations: progress.iteration,
             final_episodes: config.run.final_episodes,
-            target_reached: progress.on_target >= 2,
+            target_reached,
             weights_sha256,
             task: config.task.name.to_string(),
             executor: config.executor.kind.to_string(),
@@ -257,10 +277,24 @@ impl Summary {
     }
 }
 
-/// metrics.jsonl of a run folder.
+/// Lines that are kept for a disk that takes none; the oldest go first.
+const WAITING: usize = 4096;
+
+/// metrics.jsonl of a run folder. What the disk does not take now waits until it does: neither a full disk nor a kill leaves
+/// half a line in the middle.
 #[derive(Debug)]
 pub struct MetricsFile {
-    file: Option<(File, PathBuf)>,
+    file: Option<Lines>,
+}
+
+#[derive(Debug)]
+struct Lines {
+    path: PathBuf,
+    /// Opened for appending.
+    file: File,
+    /// Bytes of whole lines.
+    length: u64,
+    waiting: VecDeque<String>,
 }
 
 impl MetricsFile {
@@ -272,8 +306,8 @@ impl MetricsFile {
     /// An empty file.
     pub fn create(folder: &Path) -> Result<Self, TrainError> {
         let path = folder.join("metrics.jsonl");
-        let file = File::create(&path).map_err(|error| TrainError::Io { path: path.clone(), error })?;
-        Ok(Self { file: Some((file, path)) })
+        File::create(&path).map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        Self::open(path)
     }
 
     /// The file of a resumed run, cut back to the iterations that the checkpoint contains: the others will be done again,
@@ -281,10 +315,11 @@ impl MetricsFile {
     pub fn reopen(folder: &Path, iteration: u32) -> Result<Self, TrainError> {
         let path = folder.join("metrics.jsonl");
         let io = |error| TrainError::Io { path: path.clone(), error };
-        let text = std::fs::read_to_string(&path).or_else(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => Ok(String::new()),
+        let bytes = std::fs::read(&path).or_else(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => Ok(Vec::new()),
             _ => Err(io(e)),
         })?;
+        let text = String::from_utf8_lossy(&bytes);
         let kept: String = text
             .lines()
             .filter(|line| {
@@ -294,19 +329,108 @@ impl MetricsFile {
             })
             .flat_map(|line| [line, "\n"])
             .collect();
-        let temporary = folder.join(".metrics.jsonl.tmp");
-        std::fs::write(&temporary, kept).and_then(|()| std::fs::rename(&temporary, &path)).map_err(io)?;
-        let file = OpenOptions::new().append(true).open(&path).map_err(io)?;
-        Ok(Self { file: Some((file, path)) })
+        // A disk without room must not keep a run from going on: what is cut off at the end needs none.
+        if bytes.starts_with(kept.as_bytes()) && path.exists() {
+            let file = OpenOptions::new().write(true).open(&path).map_err(io)?;
+            file.set_len(kept.len() as u64).map_err(io)?;
+        } else {
+            replace_file(&mut FileSystem, folder, "metrics.jsonl", kept.as_bytes()).map_err(io)?;
+        }
+        Self::open(path)
     }
 
-    /// Appends a line and returns it.
+    /// The last line of a run folder's file, if it has one: how the run stood.
+    pub fn last_line(folder: &Path) -> Option<String> {
+        let text = std::fs::read_to_string(folder.join("metrics.jsonl")).ok()?;
+        text.lines().next_back().map(str::to_owned)
+    }
+
+    /// Returns once the lines that are written would survive a power cut. What the disk says about that it says again when a
+    /// checkpoint is written.
+    pub fn sync(&mut self) {
+        if let Some(lines) = &self.file
+            && let Err(error) = lines.file.sync_data()
+        {
+            tracing::debug!(%error, "metrics.jsonl cannot be made durable");
+        }
+    }
+
+    fn open(path: PathBuf) -> Result<Self, TrainError> {
+        let opened = OpenOptions::new().append(true).open(&path).and_then(|file| Ok((file.metadata()?.len(), file)));
+        let (length, file) = opened.map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        Ok(Self { file: Some(Lines { path, file, length, waiting: VecDeque::new() }) })
+    }
+
+    /// Appends a line and returns it. A disk that does not take it gets it with the next one.
     pub fn append(&mut self, metrics: &IterationMetrics) -> Result<String, TrainError> {
         let line = serde_json::to_string(metrics).map_err(|e| TrainError::Result(e.to_string()))?;
-        if let Some((file, path)) = &mut self.file {
-            file.write_all(format!("{line}\n").as_bytes())
-                .map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        if let Some(lines) = &mut self.file {
+            let said = !lines.waiting.is_empty();
+            lines.waiting.push_back(format!("{line}\n"));
+            if lines.waiting.len() > WAITING {
+                lines.waiting.pop_front();
+            }
+            match lines.flush() {
+                Ok(()) if said => tracing::info!("metrics.jsonl can be written again"),
+                Ok(()) => {}
+                Err(error) if said => tracing::debug!(%error, "metrics.jsonl still cannot be written"),
+                Err(error) => tracing::error!(%error, "metrics.jsonl cannot be written; its lines wait until it can"),
+            }
         }
         Ok(line)
+    }
+
+    /// Writes what waits.
+    ///
+    /// # Errors
+    /// The disk still does not take it.
+    pub fn flush(&mut self) -> Result<(), TrainError> {
+        match &mut self.file {
+            Some(lines) => lines.flush().map_err(|error| TrainError::Io { path: lines.path.clone(), error }),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Lines {
+    fn flush(&mut self) -> std::io::Result<()> {
+        while let Some(line) = self.waiting.front() {
+            if let Err(error) = self.file.write_all(line.as_bytes()) {
+                // Part of it may be there. Cutting off needs no room.
+                self.file.set_len(self.length)?;
+                return Err(error);
+            }
+            self.length += line.len() as u64;
+            self.waiting.pop_front();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::MetadataExt as _;
+
+    fn line(iteration: u32) -> String {
+        format!("{{\"iteration\":{iteration},\"executor\":{{}}}}\n")
+    }
+
+    #[test]
+    fn what_a_resume_does_again_is_cut_off_where_it_lies() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        let half = line(4)[..9].to_owned();
+        std::fs::write(&path, line(1) + &line(2) + &line(3) + &half).unwrap();
+        let file = std::fs::metadata(&path).unwrap().ino();
+        MetricsFile::reopen(folder.path(), 2).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
+        // No room was needed for that.
+        assert_eq!(std::fs::metadata(&path).unwrap().ino(), file);
+        assert_eq!(MetricsFile::last_line(folder.path()).unwrap(), line(2).trim_end());
+        // Something in the middle that is no line is cut out.
+        std::fs::write(&path, line(1) + "half\n" + &line(2)).unwrap();
+        MetricsFile::reopen(folder.path(), 2).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
     }
 }

@@ -8,18 +8,31 @@ use crate::weights;
 use magex_core::ids::RunId;
 use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer};
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_MESSAGE_BYTES, v1};
+use magex_runtime::access::{Role, caller};
+use magex_runtime::admission::{Admission, FlightLimits};
+use magex_runtime::deadline::Deadline;
+use magex_runtime::door::{Door, Open, Rules};
 use magex_runtime::health::Health;
-use magex_runtime::{server, status};
+use magex_runtime::http::{self, Router};
+use magex_runtime::security::Security;
+use magex_runtime::server::{self, Incoming};
+use magex_runtime::status;
+use magex_runtime::tls::TlsError;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
 /// Time of a lease unless configured.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
+
+/// Methods that stay open.
+const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
+
+/// What one caller, and everybody, may have in flight. All actors of a run may be one caller.
+const FLIGHTS: FlightLimits = FlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
 
 /// What every peer is told about the run.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,18 +54,29 @@ pub struct RunIdentity {
 /// The learner's two ends: one for the network, one for the training thread.
 pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, GrpcCollector) {
     let shared = Arc::new(Shared::new(run, limits));
-    (LearnerHandle { shared: shared.clone() }, GrpcCollector::new(shared))
+    let watched = Arc::downgrade(&shared);
+    shared.metrics.before_scrape(move || {
+        if let Some(shared) = watched.upgrade() {
+            shared.look();
+        }
+    });
+    let security = Security::default();
+    (LearnerHandle { shared: shared.clone(), security }, GrpcCollector::new(shared))
 }
 
 /// The network's end of the learner.
 #[derive(Debug, Clone)]
 pub struct LearnerHandle {
     shared: Arc<Shared>,
+    security: Security,
 }
 
 /// Why serving failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
+    /// The certificates.
+    #[error("tls: {0}")]
+    Tls(#[from] TlsError),
     /// The server.
     #[error("the learner's server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
@@ -62,15 +86,31 @@ pub enum ServeError {
 }
 
 impl LearnerHandle {
+    /// Guards the port; without this anybody may do everything.
+    #[must_use]
+    pub fn guarded(self, security: Security) -> Self {
+        Self { security, ..self }
+    }
+
     /// Serves until `shutdown`. Then the trainer is told to stop, actors are told why, streams end, and the call returns
     /// within [`server::GRACE`]. After the end of the run cancel `shutdown`: actors are told that the run is complete.
-    pub async fn serve(&self, incoming: TcpIncoming, shutdown: CancellationToken) -> Result<(), ServeError> {
+    pub async fn serve(&self, incoming: Incoming, shutdown: CancellationToken) -> Result<(), ServeError> {
         let (health, health_service) = Health::new::<LearnerServiceServer<LearnerApi>>().await;
         let api = LearnerApi { shared: self.shared.clone() };
-        let router = server::builder()
-            .add_service(health_service)
-            .add_service(LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES));
-        let router = server::with_reflection(router, FILE_DESCRIPTOR_SET)?;
+        let service = LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let connections = incoming.connections();
+        let rules = Rules {
+            access: self.security.access.clone(),
+            // Callers learn from the service itself that it stops, and why.
+            admission: Admission::new(FLIGHTS, CancellationToken::new()),
+            streams: STREAMS,
+            message_bytes: MAX_MESSAGE_BYTES,
+            connections: connections.clone(),
+        };
+        let router = server::secure_builder(self.security.tls.as_ref())?
+            .add_service(Open::new(health_service, connections.clone()))
+            .add_service(Door::new(Deadline::new(service), rules));
+        let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
         let shared = self.shared.clone();
         let stopped = shutdown.clone();
         let stopping = tokio::spawn(async move {
@@ -90,9 +130,19 @@ impl LearnerHandle {
         Ok(served?)
     }
 
+    /// What the learner shows over plain HTTP.
+    pub fn routes(&self) -> Router {
+        http::routes(self.shared.metrics.clone())
+    }
+
     /// How the run stands.
     pub fn status(&self) -> v1::RunStatus {
         self.shared.status()
+    }
+
+    /// Returns once somebody has asked the learner to stop: a drain, or the shutdown.
+    pub async fn told(&self) {
+        self.shared.told().cancelled().await;
     }
 
     /// Tells the trainer to stop at once and ends every stream.
@@ -126,6 +176,7 @@ impl LearnerService for LearnerApi {
         &self,
         request: Request<Streaming<v1::RolloutRequest>>,
     ) -> Result<Response<Self::RolloutStream>, Status> {
+        caller(&request, &[Role::Actor])?;
         self.check_open()?;
         let address = request.remote_addr().map_or_else(String::new, |address| address.to_string());
         let (outbound, stream) = mpsc::channel(64);
@@ -139,6 +190,7 @@ impl LearnerService for LearnerApi {
         &self,
         request: Request<v1::WatchWeightsRequest>,
     ) -> Result<Response<Self::WatchWeightsStream>, Status> {
+        caller(&request, &[Role::Actor, Role::Commander])?;
         self.check_open()?;
         let request = request.into_inner();
         let own = &self.shared.run.run_id;
@@ -148,32 +200,68 @@ impl LearnerService for LearnerApi {
                 request.run_id
             )));
         }
+        let place = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(1);
         let board = self.shared.board.subscribe();
         let (closing, toml) = (self.shared.closing.clone(), self.shared.run.run_config_toml.clone());
-        tokio::spawn(async move { closing.run_until_cancelled(weights::stream(board, toml, reader)).await });
+        let (shared, patience) = (self.shared.clone(), self.shared.lease_time());
+        let subscribed = shared.gauges.subscriber(request.role());
+        tokio::spawn(async move {
+            let _subscribed = subscribed;
+            let sent = |version| {
+                if let Some(since) = shared.board.since(version) {
+                    shared.gauges.weights_published.observe(since.elapsed());
+                }
+            };
+            closing.run_until_cancelled(weights::stream(board, toml, reader, patience, sent)).await;
+            drop(place);
+        });
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn get_run(&self, _: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>, Status> {
+    async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>, Status> {
+        caller(&request, &[Role::Client])?;
         Ok(Response::new(v1::GetRunResponse { run: Some(self.shared.status()) }))
     }
 
     type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse, Status>>;
 
-    async fn watch_run(&self, _: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
+    async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
+        caller(&request, &[Role::Client])?;
+        let place = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(64);
-        tokio::spawn(self.shared.events.clone().stream(reader, self.shared.closing.clone()));
+        let (events, closing) = (self.shared.events.clone(), self.shared.closing.clone());
+        let sending = events.stream(reader, closing, self.shared.lease_time());
+        tokio::spawn(async move {
+            sending.await;
+            drop(place);
+        });
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn checkpoint(&self, _: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointResponse>, Status> {
+    async fn checkpoint(
+        &self,
+        request: Request<v1::CheckpointRequest>,
+    ) -> Result<Response<v1::CheckpointResponse>, Status> {
+        caller(&request, &[])?;
         self.check_open()?;
-        self.shared.request_checkpoint();
+        match self.shared.status().state() {
+            v1::RunState::Finished => {
+                return Err(status::failed_precondition("the run is complete: all of it is on disk"));
+            }
+            v1::RunState::WaitingForActors => {
+                return Err(status::failed_precondition(
+                    "no actor is connected, so the iteration does not end, and no checkpoint is written; start actors, or \
+                     drain the learner, which writes one at once",
+                ));
+            }
+            _ => self.shared.request_checkpoint(),
+        }
         Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.current_iteration() }))
     }
 
     async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+        caller(&request, &[])?;
         let reason = request.into_inner().reason;
         tracing::info!(reason, "asked to drain");
         self.shared.stop(StopReason::Drain(reason));

@@ -1,33 +1,28 @@
 //! One connection of one actor: hands out leases as credit allows, takes in results, notices silence.
 
-use crate::ingest::{admit, describe};
-use crate::ledger::{LeaseId, SessionId, Verdict};
+mod results;
+
+use crate::ledger::{Lease, LeaseId, SessionId};
 use crate::state::{ActorEntry, Shared, lock};
-use bytes::Bytes;
-use magex_core::trajectory::ShardResult;
-use magex_proto::convert::ConvertError;
 use magex_proto::parts::Assembler;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::{PROTOCOL_VERSION, v1};
-use magex_runtime::status;
+use magex_runtime::{status, trace};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
+use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
+use tracing::Span;
 
 /// What the learner says to an actor.
 pub(crate) type Outbound = mpsc::Sender<Result<v1::RolloutResponse, Status>>;
 
-/// Leases that an actor may hold, whatever credit it claims.
+/// Leases that an actor may hold, and credit that it may have beside them, whatever it claims.
 const MAX_LEASES: usize = 1024;
-
-/// Unusable results after which an actor is sent away.
-const MAX_REJECTED: u32 = 3;
-
-/// Results longer than this are decoded away from the threads that serve the network.
-const DECODE_INLINE: usize = 32 << 10;
 
 /// How a connection ends.
 #[derive(Debug)]
@@ -38,10 +33,22 @@ enum End {
     Silent,
     /// The same process connected again.
     Replaced,
-    /// The learner stops.
+    /// The learner stops, or the run is complete.
     Closing,
     /// The learner sends the actor away.
     Refused(Status),
+}
+
+impl End {
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Left => "left",
+            Self::Silent => "silent",
+            Self::Replaced => "replaced",
+            Self::Closing => "closing",
+            Self::Refused(_) => "refused",
+        }
+    }
 }
 
 /// Serves one connection from its first message to its end.
@@ -62,7 +69,11 @@ pub(crate) async fn run(
             }
         },
     };
-    let session = match greet(&shared, address, hello) {
+    if shared.finished() {
+        let _ = outbound.send(Ok(run_is_complete())).await;
+        return;
+    }
+    let session = match greet(&shared, address, hello, &outbound) {
         Ok((session, hello)) => Session::new(shared, session, hello, outbound),
         Err(refusal) => {
             tracing::warn!(reason = refusal.message(), "refused an actor");
@@ -73,11 +84,17 @@ pub(crate) async fn run(
     session.serve(inbound).await;
 }
 
+fn run_is_complete() -> v1::RolloutResponse {
+    let drain = v1::Drain { reason: "the run is complete".to_owned(), finished: true };
+    v1::RolloutResponse { message: Some(Response::Drain(drain)) }
+}
+
 /// Checks the actor's introduction and puts it on the list.
 fn greet(
     shared: &Shared,
     address: String,
     first: v1::RolloutRequest,
+    outbound: &Outbound,
 ) -> Result<((SessionId, CancellationToken), v1::Hello), Status> {
     let Some(Request::Hello(hello)) = first.message else {
         return Err(status::invalid_argument("hello", "must be the first message"));
@@ -95,6 +112,12 @@ fn greet(
              configuration, or without one to take the learner's",
             hello.task_fingerprint
         )));
+    }
+    if shared.was_sent_away(hello.incarnation) {
+        return Err(status::failed_precondition(
+            "incarnation: this process was sent away, for its results or for having none; find out why, then start the \
+             actor anew",
+        ));
     }
     let mut actors = lock(&shared.actors);
     for actor in actors.values().filter(|actor| actor.incarnation == hello.incarnation) {
@@ -118,24 +141,42 @@ fn greet(
             address,
             threads: hello.threads,
             shards_done: 0,
+            weights_version: None,
             last_seen: Instant::now(),
             replaced: replaced.clone(),
+            outbound: outbound.downgrade(),
         },
     );
+    drop(actors);
+    shared.found(&hello.actor_id);
     Ok(((id, replaced), hello))
+}
+
+/// A lease that was handed out here.
+struct Handed {
+    since: Instant,
+    /// From the lease to what became of its result.
+    span: Span,
 }
 
 struct Session {
     shared: Arc<Shared>,
     id: SessionId,
     actor_id: String,
+    incarnation: u64,
     replaced: CancellationToken,
     outbound: Outbound,
     credit: usize,
     assembler: Assembler,
     /// Lease whose result is being put together.
     assembling: Option<LeaseId>,
+    /// Leases that wait for a result.
+    handed: HashMap<LeaseId, Handed>,
     rejected: u32,
+    /// Shards in a row that it could never do.
+    failed: u32,
+    /// Results that were damaged on their way.
+    damaged: u32,
     last_heard: Instant,
 }
 
@@ -149,14 +190,32 @@ impl Session {
         tracing::info!(actor = hello.actor_id, threads = hello.threads, "actor joined");
         let assembler = Assembler::new(shared.limits.max_result_bytes());
         let last_heard = Instant::now();
-        let (actor_id, assembling, credit, rejected) = (hello.actor_id, None, 0, 0);
-        Self { shared, id, actor_id, replaced, outbound, credit, assembler, assembling, rejected, last_heard }
+        Self {
+            shared,
+            id,
+            actor_id: hello.actor_id,
+            incarnation: hello.incarnation,
+            replaced,
+            outbound,
+            credit: 0,
+            assembler,
+            assembling: None,
+            handed: HashMap::new(),
+            rejected: 0,
+            failed: 0,
+            damaged: 0,
+            last_heard,
+        }
     }
 
     async fn serve(mut self, inbound: Streaming<v1::RolloutRequest>) {
         let end = self.talk(inbound).await;
         let lost = self.shared.with_ledger(|ledger| ledger.drop_actor(self.id));
-        lock(&self.shared.actors).remove(&self.id);
+        self.shared.left(self.id);
+        self.shared.gauges.session_ended(end.name());
+        if !matches!(end, End::Closing) {
+            self.shared.miss(&self.actor_id);
+        }
         let (actor, rejected) = (&self.actor_id, self.rejected);
         match end {
             End::Left => tracing::info!(actor, lost, "actor left"),
@@ -167,12 +226,13 @@ impl Session {
                 let _ = self.outbound.try_send(Err(Status::deadline_exceeded(problem)));
             }
             End::Replaced => tracing::info!(actor, lost, "actor connected again"),
+            End::Closing if self.shared.finished() => {
+                let _ = self.outbound.try_send(Ok(run_is_complete()));
+            }
             End::Closing => {
-                let finished = self.shared.finished();
                 let reason = self.shared.stop_requested().map_or_else(String::new, |reason| reason.to_string());
-                let reason = if finished { "the run is complete".to_owned() } else { reason };
-                let drain = v1::RolloutResponse { message: Some(Response::Drain(v1::Drain { reason, finished })) };
-                let _ = self.outbound.try_send(Ok(drain));
+                let drain = Response::Drain(v1::Drain { reason, finished: false });
+                let _ = self.outbound.try_send(Ok(v1::RolloutResponse { message: Some(drain) }));
             }
             End::Refused(refusal) => {
                 tracing::warn!(actor, lost, reason = refusal.message(), "sent an actor away");
@@ -181,10 +241,13 @@ impl Session {
         }
     }
 
-    async fn talk(&mut self, mut inbound: Streaming<v1::RolloutRequest>) -> End {
+    async fn talk<S>(&mut self, mut inbound: S) -> End
+    where
+        S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
+    {
         // Before the first look at the queue, so that nothing queued later goes unseen.
         let mut work = self.shared.work();
-        let closing = self.shared.closing.clone();
+        let (closing, complete) = (self.shared.closing.clone(), self.shared.complete.clone());
         let (replaced, outbound) = (self.replaced.clone(), self.outbound.clone());
         if let Err(end) = self.say(self.welcome()).await {
             return end;
@@ -195,23 +258,28 @@ impl Session {
                 return end;
             }
             let deadline = tokio::time::Instant::from_std(self.last_heard + self.shared.lease_time());
+            // In this order: who has said something is not silent, however late it is read.
             tokio::select! {
-                message = inbound.message() => {
+                biased;
+                () = closing.cancelled() => return End::Closing,
+                () = complete.cancelled() => return End::Closing,
+                () = replaced.cancelled() => return End::Replaced,
+                message = inbound.next() => {
                     self.heard();
                     let heard = match message {
-                        Ok(Some(v1::RolloutRequest { message: Some(message) })) => self.hear(message).await,
-                        Ok(Some(_)) => Err(End::Refused(status::invalid_argument("message", "not set or unknown"))),
-                        Ok(None) | Err(_) => Err(End::Left),
+                        Some(Ok(v1::RolloutRequest { message: Some(message) })) => self.hear(message).await,
+                        Some(Ok(_)) => Err(End::Refused(status::invalid_argument("message", "not set or unknown"))),
+                        None | Some(Err(_)) => Err(End::Left),
                     };
                     if let Err(end) = heard {
                         return end;
                     }
+                    // The time that a long result took here is not the actor's silence.
+                    self.heard();
                 }
                 changed = work.changed(), if self.credit > 0 => if changed.is_err() { return End::Closing },
-                () = tokio::time::sleep_until(deadline) => return End::Silent,
-                () = closing.cancelled() => return End::Closing,
-                () = replaced.cancelled() => return End::Replaced,
                 () = outbound.closed() => return End::Left,
+                () = tokio::time::sleep_until(deadline) => return End::Silent,
             }
         }
     }
@@ -247,119 +315,38 @@ impl Session {
 
     /// Leases out what there is, as far as the credit goes.
     async fn hand_out(&mut self) -> Result<(), End> {
-        while self.credit > 0 {
+        while self.credit > 0 && self.handed.len() < MAX_LEASES {
             let Some(lease) = self.shared.with_ledger(|ledger| ledger.lease(self.id)) else { break };
             self.credit -= 1;
             let weights_sha256 = self.shared.board.sha256(lease.shard.version).unwrap_or_default();
+            let span = self.lease_span(&lease);
+            let traceparent = trace::traceparent(&span);
+            self.handed.insert(lease.id, Handed { since: Instant::now(), span });
             let shard = Some((&lease.shard).into());
-            self.say(Response::Lease(v1::Lease { lease_id: lease.id.0, shard, weights_sha256 })).await?;
+            self.say(Response::Lease(v1::Lease { lease_id: lease.id.0, shard, weights_sha256, traceparent })).await?;
         }
         Ok(())
+    }
+
+    fn lease_span(&self, lease: &Lease) -> Span {
+        let (iteration, index, actor) = (lease.shard.iteration.0, lease.shard.index, self.actor_id.as_str());
+        let parent = lock(&self.shared.trace);
+        tracing::info_span!(target: trace::TARGET, parent: &*parent, "lease", iteration, index, actor)
     }
 
     async fn hear(&mut self, message: Request) -> Result<(), End> {
         match message {
             Request::Hello(_) => Err(End::Refused(status::invalid_argument("hello", "said twice"))),
             Request::Ready(ready) => {
-                self.credit = (self.credit + ready.credit as usize).min(MAX_LEASES);
+                self.credit = self.credit.saturating_add(ready.credit as usize).min(MAX_LEASES);
                 Ok(())
             }
             Request::Heartbeat(_) => Ok(()),
-            Request::Failed(failed) => {
-                let lease = LeaseId(failed.lease_id);
-                tracing::warn!(actor = self.actor_id, reason = failed.reason, "actor gave a lease back");
-                self.shared.with_ledger(|ledger| ledger.fail(self.id, lease, &failed.reason, failed.retryable));
-                Ok(())
-            }
+            Request::Failed(failed) => self.take_back(&failed),
             Request::Part(part) => self.take_part(part).await,
         }
     }
-
-    async fn take_part(&mut self, message: v1::ResultPart) -> Result<(), End> {
-        let lease = LeaseId(message.lease_id);
-        let Some(part) = message.part else {
-            return Err(End::Refused(status::invalid_argument("part", "missing")));
-        };
-        if part.index == 0 {
-            self.assembling = Some(lease);
-        } else if self.assembling != Some(lease) {
-            // The rest of a result that was refused already.
-            return Ok(());
-        }
-        match self.assembler.push(part) {
-            Ok(None) => Ok(()),
-            Ok(Some(bytes)) => {
-                self.assembling = None;
-                self.settle(lease, bytes).await
-            }
-            Err(error) => {
-                self.assembling = None;
-                self.reject(lease, format!("part.{error}")).await
-            }
-        }
-    }
-
-    /// Checks a whole result and tells the actor what became of it.
-    async fn settle(&mut self, lease: LeaseId, bytes: Bytes) -> Result<(), End> {
-        let result = match self.admit(bytes).await {
-            Ok(result) => result,
-            Err(error) => return self.reject(lease, error.to_string()).await,
-        };
-        let shard = *result.shard();
-        match self.shared.with_ledger(|ledger| ledger.complete(self.id, lease, result)) {
-            Verdict::Accepted => {
-                if let Some(actor) = lock(&self.shared.actors).get_mut(&self.id) {
-                    actor.shards_done += 1;
-                }
-                self.acknowledge(lease, v1::Verdict::Accepted, String::new()).await
-            }
-            Verdict::Duplicate => {
-                tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
-                self.acknowledge(lease, v1::Verdict::Duplicate, String::new()).await
-            }
-            Verdict::Rejected(reason) => self.turn_away(lease, reason).await,
-        }
-    }
-
-    async fn admit(&self, bytes: Bytes) -> Result<ShardResult, ConvertError> {
-        let shared = self.shared.clone();
-        let short = bytes.len() <= DECODE_INLINE;
-        let check = move || admit(&shared.limits, &shared.run.run_id, bytes);
-        let delivery = if short {
-            check()?
-        } else {
-            let gone = |_| ConvertError::new("result", "the learner stops");
-            tokio::task::spawn_blocking(check).await.map_err(gone)??
-        };
-        let version = delivery.result.shard().version;
-        match self.shared.board.sha256(version) {
-            Some(own) if own != delivery.weights_sha256 => {
-                let theirs = &delivery.weights_sha256;
-                let problem = format!("actor used {theirs} as version {version}, learner published {own}");
-                Err(ConvertError::new("weights_sha256", problem))
-            }
-            _ => Ok(delivery.result),
-        }
-    }
-
-    async fn reject(&mut self, lease: LeaseId, reason: String) -> Result<(), End> {
-        self.shared.with_ledger(|ledger| ledger.reject(self.id, lease));
-        self.turn_away(lease, reason).await
-    }
-
-    async fn turn_away(&mut self, lease: LeaseId, reason: String) -> Result<(), End> {
-        self.rejected += 1;
-        tracing::warn!(actor = self.actor_id, reason, "rejected a result; the shard will be done again");
-        self.acknowledge(lease, v1::Verdict::Rejected, reason.clone()).await?;
-        if self.rejected < MAX_REJECTED {
-            return Ok(());
-        }
-        let (field, problem) = reason.split_once(": ").unwrap_or(("result", &reason));
-        let problem = format!("{problem} ({MAX_REJECTED} results of this actor were not usable)");
-        Err(End::Refused(status::invalid_argument(field, problem)))
-    }
-
-    async fn acknowledge(&self, lease: LeaseId, verdict: v1::Verdict, reason: String) -> Result<(), End> {
-        self.say(Response::Ack(v1::Ack { lease_id: lease.0, verdict: verdict.into(), reason })).await
-    }
 }
+
+#[cfg(test)]
+mod tests;

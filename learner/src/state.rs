@@ -1,20 +1,34 @@
 //! What the training thread and the connections share.
 
-use crate::collector::{CollectError, RunEvent, StopReason};
+use crate::collector::{CollectError, IterationReport, RunEvent, StopReason};
 use crate::events::Events;
+use crate::gauges::LearnerGauges;
 use crate::ingest::Limits;
-use crate::ledger::{GivenUp, Ledger, PlanError, SessionId};
+use crate::ledger::{Counters, GivenUp, Ledger, PlanError, SessionId};
 use crate::service::RunIdentity;
+use crate::tally::Tally;
 use crate::weights::{Board, Weights};
-use magex_core::ids::{Shard, ShardKind};
+use magex_core::ids::{Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1;
-use std::collections::BTreeMap;
+use magex_runtime::metrics::Metrics;
+use magex_runtime::status;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use tokio::sync::watch;
+use tokio::sync::mpsc::WeakSender;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
+use tracing::Span;
+
+/// A lost actor is expected back for so long.
+const MISSED: Duration = Duration::from_secs(600);
+/// Lost actors that are remembered.
+const MOST_MISSED: usize = 1024;
+/// Processes that are remembered as sent away.
+const SENT_AWAY: usize = 1024;
 
 /// A panic of another thread leaves our plain data usable.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -29,9 +43,20 @@ pub(crate) struct ActorEntry {
     pub(crate) address: String,
     pub(crate) threads: u32,
     pub(crate) shards_done: u64,
+    /// Of the latest result.
+    pub(crate) weights_version: Option<WeightsVersion>,
     pub(crate) last_seen: Instant,
     /// Ends the connection: the same process has connected again.
     pub(crate) replaced: CancellationToken,
+    /// The queue of what it is to be told.
+    pub(crate) outbound: WeakSender<Result<v1::RolloutResponse, Status>>,
+}
+
+impl ActorEntry {
+    /// Messages that wait to be sent to it.
+    fn waiting(&self) -> usize {
+        self.outbound.upgrade().map_or(0, |queue| queue.max_capacity() - queue.capacity())
+    }
 }
 
 #[derive(Debug, Default)]
@@ -44,6 +69,16 @@ struct Progress {
     finished: bool,
 }
 
+impl Progress {
+    fn take(&mut self, report: &IterationReport) {
+        self.iterations = report.iteration.0;
+        self.joint_env_steps = report.joint_env_steps;
+        self.success = report.success.or(self.success);
+        self.reward = report.reward.or(self.reward);
+        self.metrics_json.clone_from(&report.metrics_json);
+    }
+}
+
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) run: RunIdentity,
@@ -51,8 +86,23 @@ pub(crate) struct Shared {
     pub(crate) board: Board,
     pub(crate) events: Arc<Events>,
     pub(crate) actors: Mutex<BTreeMap<SessionId, ActorEntry>>,
+    /// Actors that are gone, by name, and since when.
+    missed: Mutex<BTreeMap<String, Instant>>,
+    pub(crate) metrics: Arc<Metrics>,
+    pub(crate) gauges: LearnerGauges,
+    pub(crate) tally: Mutex<Tally>,
+    /// The span of the iteration that is being collected.
+    pub(crate) trace: Mutex<Span>,
     /// Ends every stream.
     pub(crate) closing: CancellationToken,
+    /// The run is complete: there is nothing left to lease.
+    pub(crate) complete: CancellationToken,
+    /// A place for every thread that decodes a result: more than processors would only hold memory.
+    pub(crate) decoders: Semaphore,
+    /// A place for everyone who watches weights or events.
+    watchers: Arc<Semaphore>,
+    /// Processes that were sent away. Whoever starts anew has another number.
+    sent_away: Mutex<VecDeque<u64>>,
     started: Instant,
     sessions: AtomicU64,
     ledger: Mutex<Ledger>,
@@ -61,6 +111,8 @@ pub(crate) struct Shared {
     /// Changes when there is work to hand out.
     work: watch::Sender<u64>,
     stop: Mutex<Option<StopReason>>,
+    /// Cancelled with the first reason to stop.
+    told: CancellationToken,
     checkpoint: AtomicBool,
     progress: Mutex<Progress>,
 }
@@ -69,19 +121,32 @@ impl Shared {
     pub(crate) fn new(run: RunIdentity, limits: Limits) -> Self {
         // The upper half differs between processes: the ledger never takes a lease of an earlier process for its own.
         let first_lease = magex_runtime::backoff::incarnation() << 32;
+        let metrics = Arc::new(Metrics::new());
+        let gauges = LearnerGauges::new(&metrics);
+        let watchers = Arc::new(Semaphore::new(limits.max_watchers));
         Self {
             run,
             limits,
             board: Board::new(),
             events: Arc::new(Events::new()),
             actors: Mutex::default(),
+            missed: Mutex::default(),
+            metrics,
+            gauges,
+            tally: Mutex::default(),
+            trace: Mutex::new(Span::none()),
             closing: CancellationToken::new(),
+            complete: CancellationToken::new(),
+            decoders: Semaphore::new(magex_runtime::process::processors()),
+            watchers,
+            sent_away: Mutex::default(),
             started: Instant::now(),
             sessions: AtomicU64::new(0),
             ledger: Mutex::new(Ledger::new(first_lease)),
             settled: Condvar::new(),
             work: watch::Sender::new(0),
             stop: Mutex::default(),
+            told: CancellationToken::new(),
             checkpoint: AtomicBool::new(false),
             progress: Mutex::default(),
         }
@@ -90,6 +155,32 @@ impl Shared {
     /// A number that no other connection has.
     pub(crate) fn next_session(&self) -> u64 {
         self.sessions.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// A place for a watcher, held as long as its stream.
+    pub(crate) fn watcher(&self) -> Result<OwnedSemaphorePermit, Status> {
+        self.watchers.clone().try_acquire_owned().map_err(|_| {
+            let limit = self.limits.max_watchers;
+            status::resource_exhausted(format!("watchers: all {limit} places are taken"), Duration::from_secs(5))
+        })
+    }
+
+    /// The processes of the actors that are here.
+    pub(crate) fn present(&self) -> Vec<u64> {
+        lock(&self.actors).values().map(|actor| actor.incarnation).collect()
+    }
+
+    /// Keeps a process away whose results are not usable, or that has none.
+    pub(crate) fn send_away(&self, incarnation: u64) {
+        let mut sent_away = lock(&self.sent_away);
+        sent_away.push_back(incarnation);
+        if sent_away.len() > SENT_AWAY {
+            sent_away.pop_front();
+        }
+    }
+
+    pub(crate) fn was_sent_away(&self, incarnation: u64) -> bool {
+        lock(&self.sent_away).contains(&incarnation)
     }
 
     pub(crate) fn lease_time(&self) -> Duration {
@@ -103,6 +194,9 @@ impl Shared {
         let value = change(&mut ledger);
         let more_work = ledger.queued() > before;
         let settled = ledger.is_complete() || ledger.given_up().is_some();
+        let shards = ledger.counters();
+        self.gauges.ledger(&shards, &ledger.episodes(), ledger.queued());
+        lock(&self.tally).held(shards.outstanding, Instant::now());
         drop(ledger);
         if settled {
             self.settled.notify_all();
@@ -118,7 +212,47 @@ impl Shared {
     }
 
     pub(crate) fn open(&self, plan: Vec<Shard>) -> Result<(), PlanError> {
-        self.with_ledger(|ledger| ledger.open(plan))
+        *lock(&self.trace) = Span::current();
+        self.with_ledger(|ledger| {
+            ledger.open(plan)?;
+            lock(&self.tally).open();
+            Ok(())
+        })
+    }
+
+    /// Notes that an actor is gone, unless it is here on another connection.
+    pub(crate) fn miss(&self, name: &str) {
+        if lock(&self.actors).values().any(|actor| actor.actor_id == name) {
+            return;
+        }
+        let mut missed = lock(&self.missed);
+        if missed.len() < MOST_MISSED {
+            missed.insert(name.to_owned(), Instant::now());
+        }
+    }
+
+    /// Notes that an actor is here.
+    pub(crate) fn found(&self, name: &str) {
+        lock(&self.missed).remove(name);
+    }
+
+    /// Sets the metrics that are only known by looking.
+    pub(crate) fn look(&self) {
+        let (live, threads, waiting) = {
+            let actors = lock(&self.actors);
+            let sum = |f: fn(&ActorEntry) -> usize| actors.values().map(f).sum::<usize>();
+            (actors.len(), sum(|a| a.threads as usize), sum(ActorEntry::waiting))
+        };
+        let missed = {
+            let mut missed = lock(&self.missed);
+            missed.retain(|_, since| since.elapsed() < MISSED);
+            missed.len()
+        };
+        self.gauges.actors_live.set(live as f64);
+        self.gauges.actors_expected.set((live + missed) as f64);
+        self.gauges.actor_threads.set(threads as f64);
+        self.gauges.queue("actors", waiting);
+        self.gauges.queue("events", self.events.len());
     }
 
     /// Blocks until the open plan is done, given up, or the process is told to stop.
@@ -126,22 +260,41 @@ impl Shared {
         let mut ledger = lock(&self.ledger);
         loop {
             if let Some(results) = ledger.take() {
+                self.end_trace();
                 return Ok(results);
             }
             if let Some(GivenUp { shard, reason }) = ledger.given_up().cloned() {
                 ledger.abandon();
+                self.end_trace();
                 return Err(CollectError::Shard { shard, reason });
             }
-            // A drain lets the iteration finish; a shutdown does not.
-            if self.stop_requested() == Some(StopReason::Shutdown) {
+            // A drain lets the iteration finish if there is anybody to finish it; a shutdown does not.
+            let stop = self.stop_requested();
+            if let Some(reason) = stop.filter(|r| *r == StopReason::Shutdown || lock(&self.actors).is_empty()) {
                 ledger.abandon();
-                return Err(CollectError::Stopped(StopReason::Shutdown));
+                self.end_trace();
+                return Err(CollectError::Stopped(reason));
             }
             if ledger.progress().1 == 0 {
                 return Err(CollectError::Other("no plan is open".to_owned()));
             }
             ledger = self.settled.wait(ledger).unwrap_or_else(PoisonError::into_inner);
         }
+    }
+
+    /// Lets go of the iteration's span, which ends, and is exported, with the last that holds it.
+    fn end_trace(&self) {
+        *lock(&self.trace) = Span::none();
+    }
+
+    /// Takes an actor off the list, and wakes the trainer, which may wait in vain from now on.
+    pub(crate) fn left(&self, session: SessionId) {
+        {
+            // Under the ledger's lock, so that the trainer cannot miss it between looking and waiting.
+            let _ledger = lock(&self.ledger);
+            lock(&self.actors).remove(&session);
+        }
+        self.settled.notify_all();
     }
 
     /// Asks the trainer to stop. A shutdown wins over a drain.
@@ -155,6 +308,12 @@ impl Shared {
             }
         }
         self.settled.notify_all();
+        self.told.cancel();
+    }
+
+    /// Somebody asked the learner to stop.
+    pub(crate) fn told(&self) -> &CancellationToken {
+        &self.told
     }
 
     pub(crate) fn stop_requested(&self) -> Option<StopReason> {
@@ -170,25 +329,30 @@ impl Shared {
     }
 
     pub(crate) fn record(&self, event: RunEvent) {
+        let finished = matches!(event, RunEvent::Finished { .. });
         {
             let mut progress = lock(&self.progress);
             match &event {
-                RunEvent::Iteration(report) => {
-                    progress.iterations = report.iteration.0 + 1;
-                    progress.joint_env_steps = report.joint_env_steps;
-                    progress.success = report.success.or(progress.success);
-                    progress.reward = report.reward.or(progress.reward);
-                    progress.metrics_json.clone_from(&report.metrics_json);
-                }
+                RunEvent::Iteration(report) => progress.take(report),
                 RunEvent::Finished { .. } => progress.finished = true,
                 RunEvent::Log(_) | RunEvent::Checkpoint { .. } => {}
             }
         }
         self.events.push(event);
+        if finished {
+            self.complete.cancel();
+        }
+    }
+
+    /// Notes how the run stood before this process, without telling it to watchers as something new.
+    pub(crate) fn reported(&self, report: &IterationReport) {
+        lock(&self.progress).take(report);
     }
 
     /// Makes weights known. Iteration k uses version k: so many iterations are done, in this process or before it.
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
+        self.gauges.weights_version.set(f64::from(weights.version.0));
+        self.gauges.weights_bytes.set(weights.bytes.len() as f64);
         lock(&self.progress).iterations = weights.version.0;
         self.board.publish(weights);
     }
@@ -227,7 +391,7 @@ impl Shared {
         let ledger = lock(&self.ledger);
         let state = self.state(actors.len(), &ledger);
         let (done, total) = ledger.progress();
-        let counters = ledger.counters();
+        let (counters, episodes) = (ledger.counters(), ledger.episodes());
         let rows = actors.iter().map(|(&session, actor)| v1::ActorStatus {
             actor_id: actor.actor_id.clone(),
             address: actor.address.clone(),
@@ -235,6 +399,7 @@ impl Shared {
             shards_done: actor.shards_done,
             last_seen_ms: actor.last_seen.elapsed().as_millis() as u64,
             threads: actor.threads,
+            weights_version: actor.weights_version.map(|version| version.0),
         });
         let actors = rows.collect();
         drop(ledger);
@@ -249,15 +414,8 @@ impl Shared {
             reward: progress.reward,
             metrics_json: progress.metrics_json.clone(),
             actors,
-            ledger: Some(v1::LedgerStatus {
-                leased: counters.leased,
-                trained: counters.trained,
-                duplicate: counters.duplicate,
-                expired: counters.expired,
-                rejected: counters.rejected,
-                failed: counters.failed,
-                outstanding: counters.outstanding,
-            }),
+            ledger: Some(books(&counters)),
+            episodes: Some(books(&episodes)),
             shards_done: done as u32,
             shards_total: total as u32,
             weights_version: latest.as_ref().map_or(0, |weights| weights.version.0),
@@ -265,5 +423,18 @@ impl Shared {
             task_fingerprint: self.run.task_fingerprint.clone(),
             uptime_seconds: self.started.elapsed().as_secs_f64(),
         }
+    }
+}
+
+fn books(counters: &Counters) -> v1::LedgerStatus {
+    v1::LedgerStatus {
+        leased: counters.leased,
+        trained: counters.trained,
+        duplicate: counters.duplicate,
+        expired: counters.expired,
+        rejected: counters.rejected,
+        failed: counters.failed,
+        outstanding: counters.outstanding,
+        residual: counters.residual() as i64,
     }
 }

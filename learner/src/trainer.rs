@@ -1,18 +1,23 @@
 //! The training loop: publish → collect → update → checkpoint → again. It runs on a thread of its own and blocks on its
 //! [`Collector`]; it knows nothing of connections.
 
+mod saving;
+
 use crate::batch::Batch;
 use crate::checkpoint::{self, CheckpointError, Learned, Progress, sha256_hex};
 use crate::collector::{CollectError, Collector, IterationReport, RunEvent, StopReason};
 use crate::commander::CommanderPpo;
 use crate::mappo::Mappo;
 use crate::metrics::{EvalSummary, IterationMetrics, MetricsFile, Summary, Timing, summarise};
+use crate::page::{LivePage, Phase};
+use crate::tensorboard::EventFile;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
 use magex_nets::commander::CommanderError;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
+use magex_runtime::trace;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -47,6 +52,18 @@ pub enum TrainError {
         /// What the system said.
         error: std::io::Error,
     },
+    /// The run is done, and what it leaves behind cannot be written.
+    #[error(
+        "{path}: {error}, for {waited} s; make room or give the rights, then continue with --resume: only the end is done again"
+    )]
+    LastFiles {
+        /// Which.
+        path: PathBuf,
+        /// What the system said.
+        error: std::io::Error,
+        /// How long it was tried.
+        waited: u64,
+    },
     /// A result that does not belong to the plan.
     #[error("results: {0}")]
     Result(String),
@@ -76,7 +93,15 @@ pub struct Trainer {
     progress: Progress,
     started: Instant,
     metrics: MetricsFile,
+    events: EventFile,
+    page: Option<Arc<LivePage>>,
     pool: Arc<rayon::ThreadPool>,
+    /// A run that was complete when it was opened, and its summary as it is on disk.
+    complete: Option<(Summary, String)>,
+    /// How a resumed run stood.
+    before: Option<IterationReport>,
+    /// Checkpoints in a row that could not be written.
+    failed_checkpoints: u32,
 }
 
 impl Trainer {
@@ -84,11 +109,13 @@ impl Trainer {
     pub fn create(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mut trainer = Self::prepare(config, run_id, folder, threads)?;
         trainer.metrics = MetricsFile::create(folder)?;
+        trainer.events = EventFile::new(folder, None);
         trainer.checkpoint()?;
         Ok(trainer)
     }
 
-    /// A run that continues from its newest usable checkpoint. What was wrong with newer ones is returned.
+    /// A run that continues from its newest usable checkpoint. What was wrong with newer ones is returned. A run that is
+    /// complete stays as it is.
     pub fn resume(
         config: &RunConfig,
         folder: &Path,
@@ -103,7 +130,13 @@ impl Trainer {
             )));
         }
         trainer.run_id = RunId(progress.run_id.clone());
-        trainer.metrics = MetricsFile::reopen(folder, progress.iteration)?;
+        checkpoint::clean(folder);
+        trainer.complete = summary_of(folder, progress.iteration, &learned)?;
+        if trainer.complete.is_none() {
+            trainer.metrics = MetricsFile::reopen(folder, progress.iteration)?;
+            trainer.events = EventFile::new(folder, Some(progress.joint_env_steps));
+        }
+        trainer.before = MetricsFile::last_line(folder).and_then(IterationReport::of);
         trainer.progress = progress;
         trainer.learned = learned;
         Ok((trainer, skipped))
@@ -141,7 +174,12 @@ impl Trainer {
             progress,
             started: Instant::now(),
             metrics: MetricsFile::none(),
+            events: EventFile::none(),
+            page: None,
             pool: Arc::new(pool),
+            complete: None,
+            before: None,
+            failed_checkpoints: 0,
         })
     }
 
@@ -155,46 +193,87 @@ impl Trainer {
         &self.learned
     }
 
+    /// Shows the run on a page, with what it wrote down before.
+    pub fn show(&mut self, page: Arc<LivePage>) {
+        page.begin(&self.run_id, &self.folder);
+        self.page = Some(page);
+    }
+
+    fn tell(&self, what: impl FnOnce(&LivePage)) {
+        if let Some(page) = &self.page {
+            what(page);
+        }
+    }
+
     /// Trains until the target is reached, the budget is spent, or somebody asks to stop.
     pub fn run(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
+        let outcome = self.train(collector);
+        self.tell(|page| page.ended(&outcome));
+        outcome
+    }
+
+    fn train(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
+        if let Some(before) = self.before.take() {
+            collector.resumed(&before);
+        }
+        if let Some((summary, line)) = self.complete.take() {
+            // Nothing is computed or written again; commanders and watchers that come late are served.
+            self.publish(collector)?;
+            collector.event(RunEvent::Finished { summary_json: line });
+            return Ok(Outcome::Finished(Box::new(summary)));
+        }
         let budget = self.config.max_iterations();
         // Spent on the checkpoint after the line before.
         let mut checkpoint_s = 0.0;
         loop {
             let iteration = self.progress.iteration;
+            // Ends with the iteration; leases, and what comes of them in other processes, are its children.
+            let _span = tracing::info_span!(target: trace::TARGET, parent: None, "iteration", iteration).entered();
+            let clock = Instant::now();
             self.publish(collector)?;
+            let publish_s = clock.elapsed().as_secs_f64();
             let evaluate = iteration.is_multiple_of(self.config.run.eval_every) || iteration >= budget;
             let train = iteration < budget;
-            let mut timing = Timing { checkpoint_s, ..Timing::default() };
+            let mut timing = Timing { checkpoint_s, publish_s, ..Timing::default() };
 
             // Collect: evaluation of version k and training episodes under version k in one plan, so that no actor idles.
             let clock = Instant::now();
             let mut plan = Vec::new();
             if evaluate {
                 let episodes = self.config.run.eval_episodes;
-                plan.extend(self.evaluation(EVAL_SET_TRAINING, episodes, Mode::Greedy, false));
+                // Somebody may look at it; no number depends on that.
+                plan.extend(self.evaluation(EVAL_SET_TRAINING, episodes, Mode::Greedy, self.page.is_some()));
             }
             if train {
                 plan.extend(self.training());
             }
+            self.tell(|page| page.phase(if train { Phase::Collecting } else { Phase::Evaluating }));
             let results = match collector.collect(plan) {
                 Err(CollectError::Stopped(reason)) => return self.stop(collector, reason),
                 other => other?,
             };
             timing.collect_s = clock.elapsed().as_secs_f64();
             let (trajectories, outcomes) = split(results);
+            self.tell(|page| page.evaluated(&outcomes));
             let evaluation = summarise(outcomes.iter().flat_map(|o| &o.metrics));
-            if let Some(evaluation) = &evaluation {
-                let reached = evaluation.success_rate >= f64::from(self.config.run.target_success);
-                self.progress.on_target = if reached { self.progress.on_target + 1 } else { 0 };
-            }
-            if self.progress.on_target >= 2 || !train {
+            // Counted when the iteration is complete: whoever resumes before that evaluates again.
+            let on_target = match &evaluation {
+                Some(evaluation) if evaluation.success_rate >= f64::from(self.config.run.target_success) => {
+                    self.progress.on_target.saturating_add(1)
+                }
+                Some(_) => 0,
+                None => self.progress.on_target,
+            };
+            let target_reached = on_target >= 2;
+            if target_reached || !train {
                 self.record(collector, &[], evaluation, timing, None)?;
-                return self.finish(collector);
+                return self.finish(collector, target_reached);
             }
 
             // Update.
+            self.tell(|page| page.phase(Phase::Training));
             let clock = Instant::now();
+            let span = tracing::info_span!(target: trace::TARGET, "update").entered();
             let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
             let (mappo, learned, seed) = (&self.mappo, &mut self.learned, self.config.run.seed);
             let stats = self.pool.install(|| {
@@ -206,7 +285,9 @@ impl Trainer {
             let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
             let commander = self.commander.update(&mut self.learned.commander, &trajectories, iteration, rate)?;
             timing.commander_s = clock.elapsed().as_secs_f64();
+            drop(span);
 
+            self.progress.on_target = on_target;
             self.progress.iteration += 1;
             self.progress.joint_env_steps += self.config.steps_per_iteration();
             // The line comes before the checkpoint: a kill in between costs nothing, a resume cuts the line off again.
@@ -216,12 +297,7 @@ impl Trainer {
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
             if due || stop.is_some() || collector.checkpoint_requested() {
-                let path = self.checkpoint()?;
-                let event = RunEvent::Checkpoint {
-                    iteration: Iteration(self.progress.iteration),
-                    path: path.display().to_string(),
-                };
-                collector.event(event);
+                self.save(collector);
             }
             checkpoint_s = clock.elapsed().as_secs_f64();
             if let Some(reason) = stop {
@@ -233,6 +309,7 @@ impl Trainer {
     fn publish(&self, collector: &mut dyn Collector) -> Result<(), TrainError> {
         let bytes = self.learned.broadcast()?;
         let weights = Weights::new(self.run_id.clone(), WeightsVersion(self.progress.iteration), bytes.into());
+        self.tell(|page| page.published(&weights));
         Ok(collector.publish(&Arc::new(weights))?)
     }
 
@@ -286,11 +363,14 @@ impl Trainer {
             &self.progress,
             summarise(episodes),
             evaluation,
-            timing,
+            timing.judged(collector.collected().as_ref()),
             updates,
             wall_s,
         );
         let line = self.metrics.append(&metrics)?;
+        collector.measured(&metrics);
+        self.events.append(&line, metrics.joint_env_steps);
+        self.tell(|page| page.line(&line));
         collector.event(RunEvent::Iteration(IterationReport {
             iteration: Iteration(metrics.iteration),
             joint_env_steps: metrics.joint_env_steps,
@@ -302,17 +382,19 @@ impl Trainer {
     }
 
     /// The evaluation that closes a run, the last checkpoint, and the summary.
-    fn finish(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
+    fn finish(&mut self, collector: &mut dyn Collector, target_reached: bool) -> Result<Outcome, TrainError> {
         let wall_s = self.progress.wall_s + self.started.elapsed().as_secs_f64();
-        self.checkpoint()?;
+        self.save(collector);
         let episodes = self.config.run.final_episodes;
         let mut plan: Vec<Shard> = self.evaluation(EVAL_SET_FINAL, episodes, Mode::Greedy, true).collect();
         plan.extend(self.evaluation(EVAL_SET_FINAL, episodes, Mode::Sampled, false));
+        self.tell(|page| page.phase(Phase::Evaluating));
         let results = match collector.collect(plan) {
             Err(CollectError::Stopped(reason)) => return Ok(Outcome::Stopped(reason)),
             other => other?,
         };
         let (_, outcomes) = split(results);
+        self.tell(|page| page.evaluated(&outcomes));
         let of = |mode: Mode| {
             summarise(outcomes.iter().filter(|o| o.shard.mode == mode).flat_map(|o| &o.metrics))
                 .ok_or_else(|| TrainError::Result("the final evaluation came back empty".to_owned()))
@@ -323,46 +405,36 @@ impl Trainer {
             &self.progress,
             &of(Mode::Greedy)?,
             &of(Mode::Sampled)?,
+            target_reached,
             wall_s,
             sha256_hex(&weights),
         );
         let recordings: Vec<&Recording> = outcomes.iter().filter_map(|o| o.recording.as_ref()).collect();
-        self.write("weights.safetensors", &weights)?;
-        self.write("recordings.json", &json(&recordings)?)?;
         let line = String::from_utf8_lossy(&json(&summary)?).into_owned();
-        self.write("summary.json", line.as_bytes())?;
+        let recordings = json(&recordings)?;
+        // The summary comes last: who sees it sees everything.
+        let files: [(&str, &[u8]); 3] =
+            [("weights.safetensors", &weights), ("recordings.json", &recordings), ("summary.json", line.as_bytes())];
+        if let Some(reason) = self.write_at_last(collector, &files)? {
+            return Ok(Outcome::Stopped(reason));
+        }
         collector.event(RunEvent::Finished { summary_json: line });
         Ok(Outcome::Finished(Box::new(summary)))
     }
 
     /// Stopped before the iteration was collected: the last completed iteration is what resumes.
     fn stop(&mut self, collector: &mut dyn Collector, reason: StopReason) -> Result<Outcome, TrainError> {
-        let path = self.checkpoint()?;
-        let event =
-            RunEvent::Checkpoint { iteration: Iteration(self.progress.iteration), path: path.display().to_string() };
-        collector.event(event);
+        self.save(collector);
         Ok(Outcome::Stopped(reason))
     }
+}
 
-    fn checkpoint(&mut self) -> Result<PathBuf, TrainError> {
-        let (e, c) = (&self.learned.executor, &self.learned.commander);
-        let progress = Progress {
-            value_norm: e.value_norm,
-            adam_steps: [e.actor_adam.steps, e.critic_adam.steps, c.adam.steps],
-            wall_s: self.progress.wall_s + self.started.elapsed().as_secs_f64(),
-            ..self.progress.clone()
-        };
-        Ok(checkpoint::write(&self.folder, &progress, &self.learned, self.config.run.keep_checkpoints)?)
-    }
-
-    /// Whole files only: written under a temporary name and renamed.
-    fn write(&self, name: &str, bytes: &[u8]) -> Result<(), TrainError> {
-        let path = self.folder.join(name);
-        let temporary = self.folder.join(format!(".{name}.tmp"));
-        std::fs::write(&temporary, bytes)
-            .and_then(|()| std::fs::rename(&temporary, &path))
-            .map_err(|error| TrainError::Io { path, error })
-    }
+/// The summary of a run that is complete: it is there, and about what the checkpoint holds.
+fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option<(Summary, String)>, TrainError> {
+    let Ok(line) = std::fs::read_to_string(folder.join("summary.json")) else { return Ok(None) };
+    let Ok(summary) = serde_json::from_str::<Summary>(&line) else { return Ok(None) };
+    let same = summary.iterations == iteration && summary.weights_sha256 == sha256_hex(&learned.weights()?);
+    Ok(same.then_some((summary, line)))
 }
 
 /// SHA-256 of everything that decides a run's numbers.

@@ -5,6 +5,7 @@ use magex_proto::v1::WatchWeightsResponse;
 pub use magex_proto::weights::Weights;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 use tonic::Status;
 
@@ -23,21 +24,22 @@ type Snapshot = Arc<Vec<Arc<Weights>>>;
 pub(crate) struct Board {
     /// The latest versions, newest last.
     kept: watch::Sender<Snapshot>,
-    hashes: Mutex<BTreeMap<WeightsVersion, String>>,
+    /// Their hashes, and when they were published.
+    published: Mutex<BTreeMap<WeightsVersion, (String, Instant)>>,
 }
 
 impl Board {
     pub(crate) fn new() -> Self {
-        Self { kept: watch::Sender::new(Snapshot::default()), hashes: Mutex::default() }
+        Self { kept: watch::Sender::new(Snapshot::default()), published: Mutex::default() }
     }
 
     /// Makes a version the latest. One that is not newer than the latest begins anew (a learner that went back).
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
         {
-            let mut hashes = lock(&self.hashes);
-            hashes.insert(weights.version, weights.sha256.clone());
-            while hashes.len() > REMEMBERED {
-                hashes.pop_first();
+            let mut published = lock(&self.published);
+            published.insert(weights.version, (weights.sha256.clone(), Instant::now()));
+            while published.len() > REMEMBERED {
+                published.pop_first();
             }
         }
         self.kept.send_modify(|kept| {
@@ -65,7 +67,12 @@ impl Board {
     }
 
     pub(crate) fn sha256(&self, version: WeightsVersion) -> Option<String> {
-        lock(&self.hashes).get(&version).cloned()
+        lock(&self.published).get(&version).map(|published| published.0.clone())
+    }
+
+    /// When a version was published.
+    pub(crate) fn since(&self, version: WeightsVersion) -> Option<Instant> {
+        lock(&self.published).get(&version).map(|published| published.1)
     }
 
     pub(crate) fn subscribe(&self) -> watch::Receiver<Snapshot> {
@@ -73,12 +80,15 @@ impl Board {
     }
 }
 
-/// Sends what is kept and then every newer version, each whole, until the reader leaves. Versions that are replaced while the
-/// reader is slow are never sent.
+/// Sends what is kept and then every newer version, each whole, until the reader leaves or takes nothing for as long as
+/// `patience`. Versions that are replaced while the reader is slow are never sent. `sent_newer` is told of every version that
+/// the reader was waiting for.
 pub(crate) async fn stream(
     mut board: watch::Receiver<Snapshot>,
     run_config_toml: String,
     reader: mpsc::Sender<Result<WatchWeightsResponse, Status>>,
+    patience: Duration,
+    sent_newer: impl Fn(WeightsVersion),
 ) {
     let mut sent: Option<Arc<Weights>> = None;
     loop {
@@ -89,9 +99,17 @@ pub(crate) async fn stream(
         match next {
             Some(weights) => {
                 for message in weights.messages(&run_config_toml) {
-                    if reader.send(Ok(message)).await.is_err() {
-                        return;
+                    match reader.send_timeout(Ok(message), patience).await {
+                        Ok(()) => {}
+                        Err(mpsc::error::SendTimeoutError::Closed(_)) => return,
+                        Err(mpsc::error::SendTimeoutError::Timeout(_)) => {
+                            tracing::warn!(?patience, "a subscriber of the weights reads nothing; its stream ends");
+                            return;
+                        }
                     }
+                }
+                if sent.is_some() {
+                    sent_newer(weights.version);
                 }
                 sent = Some(weights);
             }
@@ -147,7 +165,7 @@ mod tests {
     async fn a_slow_reader_skips_to_the_latest_two() {
         let board = published([1]);
         let (tx, mut rx) = mpsc::channel(1);
-        tokio::spawn(stream(board.subscribe(), String::new(), tx));
+        tokio::spawn(stream(board.subscribe(), String::new(), tx, Duration::from_secs(60), |_| ()));
         assert_eq!(rx.recv().await.unwrap().unwrap().version, 1);
         (2..=100).for_each(|version| board.publish(weights(version)));
         let mut seen = vec![];
@@ -155,5 +173,15 @@ mod tests {
             seen.push(rx.recv().await.unwrap().unwrap().version);
         }
         assert!(seen.len() <= 4 && seen.is_sorted(), "{seen:?}");
+    }
+
+    #[tokio::test]
+    async fn a_reader_that_takes_nothing_is_let_go_of() {
+        let board = published([1, 2]);
+        let (tx, mut rx) = mpsc::channel(1);
+        // The second version finds no room.
+        stream(board.subscribe(), String::new(), tx, Duration::from_millis(20), |_| ()).await;
+        assert_eq!(rx.recv().await.unwrap().unwrap().version, 1);
+        assert!(rx.recv().await.is_none());
     }
 }

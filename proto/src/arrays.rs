@@ -48,10 +48,7 @@ pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u
 pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, ConvertError> {
     let array = array.ok_or_else(|| ConvertError::missing(field))?;
     if array.shape.len() != axes {
-        return Err(ConvertError::new(
-            field,
-            format!("shape {:?} has {} axes, not {axes}", array.shape, array.shape.len()),
-        ));
+        return Err(ConvertError::new(field, format!("its shape has {} axes, not {axes}", array.shape.len())));
     }
     Ok(array.shape.iter().map(|&extent| extent as usize).collect())
 }
@@ -76,7 +73,12 @@ fn checked(
         ));
     }
     if !array.shape.iter().map(|&extent| extent as usize).eq(shape.iter().copied()) {
-        return Err(ConvertError::new(field, format!("shape {:?} where {shape:?} is expected", array.shape)));
+        // A shape of a million axes is not repeated to whoever sent it.
+        let found = match array.shape.len() {
+            0..=8 => format!("shape {:?}", array.shape),
+            axes => format!("a shape of {axes} axes"),
+        };
+        return Err(ConvertError::new(field, format!("{found} where {shape:?} is expected")));
     }
     let expected = shape.iter().try_fold(size, |product, &extent| product.checked_mul(extent));
     if expected != Some(array.data.len()) {

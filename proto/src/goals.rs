@@ -123,7 +123,9 @@ impl GoalRequest {
     /// Reads a message: the request, and the weights that are to answer. Positions are finite afterwards.
     pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), ConvertError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
-        let scheduler = message.scheduler().into();
+        let scheduler = v1::SchedulerKind::try_from(message.scheduler)
+            .map_err(|_| ConvertError::new("scheduler", format!("{} is unknown", message.scheduler)))?
+            .into();
         let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;
         let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 4)?;
         let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
@@ -226,6 +228,13 @@ mod tests {
         assert!(
             GoalRequest::from_message(empty.to_message(&key)).unwrap_err().to_string().starts_with("agents: no stage")
         );
+    }
+
+    #[test]
+    fn a_scheduler_that_nobody_knows_is_refused() {
+        let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
+        let message = v1::AssignBatchRequest { scheduler: 77, ..request().to_message(&key) };
+        assert_eq!(GoalRequest::from_message(message).unwrap_err().to_string(), "scheduler: 77 is unknown");
     }
 
     #[test]

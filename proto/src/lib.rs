@@ -4,7 +4,9 @@
 //! comes near [`MAX_MESSAGE_BYTES`].
 
 pub mod arrays;
+pub mod codec;
 pub mod convert;
+pub mod elements;
 pub mod goals;
 pub mod parts;
 pub mod weights;
@@ -13,6 +15,11 @@ pub mod weights;
 #[allow(missing_docs, unreachable_pub, clippy::all)]
 pub mod v1 {
     tonic::include_proto!("magex.v1");
+}
+
+/// Bytes that a message takes on the wire.
+pub fn encoded_len(message: &impl prost::Message) -> usize {
+    message.encoded_len()
 }
 
 /// Version of the protocol that this build speaks; both sides of a handshake must agree on it.

@@ -2,6 +2,9 @@
 
 #![allow(clippy::expect_used, clippy::panic, reason = "tests stop where something is not as it should be")]
 
+pub mod decoders;
+pub mod proxy;
+pub mod relay;
 pub mod sandbox;
 
 use magex::local::LocalCollector;

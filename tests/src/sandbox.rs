@@ -1,7 +1,11 @@
 //! A cluster of real processes on loopback: one learner, one commander, any number of actors, each of which can be killed,
 //! stopped and started again.
 
+use crate::proxy::Proxy;
 use magex_core::config::RunConfig;
+use magex_proto::v1;
+use magex_proto::v1::learner_service_client::LearnerServiceClient;
+use magex_runtime::client;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -47,7 +51,8 @@ pub struct Process {
 }
 
 impl Process {
-    fn start(arguments: &[&str], log: &Path) -> Self {
+    /// Starts the program with these arguments; what it writes to standard error is added to `log`.
+    pub fn start(arguments: &[&str], log: &Path) -> Self {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log).expect("a log file");
         let child = Command::new(binary())
             .args(arguments)
@@ -60,13 +65,16 @@ impl Process {
     }
 
     /// Reads the line that says which address a service listens on.
-    fn ready(&mut self) -> String {
+    pub fn ready(&mut self) -> String {
+        let ready = self.ready_line();
+        ready["address"].as_str().unwrap_or_else(|| panic!("no address in '{ready}'")).to_owned()
+    }
+
+    fn ready_line(&mut self) -> serde_json::Value {
         let mut line = String::new();
         let out = self.child.stdout.take().expect("standard output is piped");
         BufReader::new(out).read_line(&mut line).expect("standard output can be read");
-        let ready: serde_json::Value =
-            serde_json::from_str(&line).unwrap_or_else(|e| panic!("ready line '{line}': {e}\n{}", self.log()));
-        ready["address"].as_str().unwrap_or_else(|| panic!("no address in '{line}'")).to_owned()
+        serde_json::from_str(&line).unwrap_or_else(|e| panic!("ready line '{line}': {e}\n{}", self.log()))
     }
 
     /// What it has written to standard error.
@@ -98,6 +106,15 @@ impl Process {
         }
     }
 
+    /// Waits for it to end by itself within this time, by the clock; how long it took.
+    pub fn wait_within(&mut self, limit: Duration) -> (ExitStatus, Duration) {
+        let start = Instant::now();
+        let status = self.wait();
+        let took = start.elapsed();
+        assert!(took <= limit, "the process took {took:?} to end, {limit:?} are allowed:\n{}", self.log());
+        (status, took)
+    }
+
     /// Whether it still runs.
     pub fn running(&mut self) -> bool {
         self.child.try_wait().expect("the process can be asked").is_none()
@@ -122,59 +139,127 @@ pub struct Cluster {
     pub commander: Option<Process>,
     /// The actors.
     pub actors: Vec<Process>,
+    /// Where services show their metrics, by name of the service; only of those that were asked to.
+    pub pages: Vec<(String, String)>,
+    /// Options that all services get.
+    extra: Vec<String>,
     learner_address: String,
     commander_address: String,
     started: usize,
+    run: PathBuf,
+    lease: String,
+    wires: Option<Wires>,
 }
 
-const LEASE: &str = "2";
+/// What is between the processes of a cluster.
+#[derive(Debug)]
+pub struct Wires {
+    /// From actors to the learner.
+    pub actors_learner: Proxy,
+    /// From actors to the commander.
+    pub actors_commander: Proxy,
+    /// From the commander to the learner.
+    pub commander_learner: Proxy,
+}
+
+impl Wires {
+    /// All of them.
+    pub fn all(&self) -> [&Proxy; 3] {
+        [&self.actors_learner, &self.actors_commander, &self.commander_learner]
+    }
+}
+
+/// How a cluster is set up.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// Seconds of a lease.
+    pub lease: f64,
+    /// The run folder, unless it is to be a temporary one.
+    pub run: Option<PathBuf>,
+    /// Everything goes through proxies that draw from this seed.
+    pub wires: Option<u64>,
+    /// Options that the learner, the commander and the actors get, too.
+    pub options: Vec<String>,
+}
+
+impl Default for Setup {
+    fn default() -> Self {
+        Self { lease: 2.0, run: None, wires: None, options: Vec::new() }
+    }
+}
+
+/// The usual set-up with these options for every process.
+pub fn options(options: &[&str]) -> Setup {
+    Setup { options: options.iter().map(|&option| option.to_owned()).collect(), ..Setup::default() }
+}
 
 impl Cluster {
     /// Starts a learner and a commander.
     pub fn start(config: &RunConfig) -> Self {
+        Self::start_with(config, Setup::default())
+    }
+
+    /// The same, set up as asked for.
+    pub fn start_with(config: &RunConfig, setup: Setup) -> Self {
+        let lease = setup.lease.to_string();
         let folder = tempfile::tempdir().expect("a folder");
         let file = folder.path().join("given.toml");
         std::fs::write(&file, config.to_toml().expect("toml")).expect("the configuration can be written");
-        let run = folder.path().join("run");
-        let mut learner = Process::start(
-            &[
-                "learner",
-                "--config",
-                &text(&file),
-                "--out",
-                &text(&run),
-                "--listen",
-                "127.0.0.1:0",
-                "--threads",
-                "1",
-                "--lease-seconds",
-                LEASE,
-            ],
-            &folder.path().join("learner.log"),
-        );
-        let learner_address = learner.ready();
+        let run = setup.run.unwrap_or_else(|| folder.path().join("run"));
+        let (given, out) = (text(&file), text(&run));
+        let mut arguments = vec!["learner", "--config", &given, "--out", &out, "--listen", "127.0.0.1:0"];
+        arguments.extend(["--threads", "1", "--lease-seconds", &lease]);
+        arguments.extend(setup.options.iter().map(String::as_str));
+        let mut learner = Process::start(&arguments, &folder.path().join("learner.log"));
+        let ready = learner.ready_line();
+        let learner_address = ready["address"].as_str().expect("the learner's address").to_owned();
+        // The commander's address must be known before it starts.
+        let commander_address = match setup.wires {
+            Some(_) => free_address(),
+            None => "127.0.0.1:0".into(),
+        };
+        let wires = setup.wires.map(|seed| Wires {
+            actors_learner: Proxy::start(&learner_address, seed),
+            actors_commander: Proxy::start(&commander_address, seed + 1),
+            commander_learner: Proxy::start(&learner_address, seed + 2),
+        });
         let mut cluster = Self {
             folder,
             learner,
             commander: None,
             actors: Vec::new(),
+            pages: Vec::new(),
+            extra: setup.options,
             learner_address,
-            commander_address: "127.0.0.1:0".into(),
+            commander_address,
             started: 0,
+            run,
+            lease,
+            wires,
         };
+        cluster.note_page("learner", &ready);
         cluster.start_commander();
         cluster
     }
 
+    fn note_page(&mut self, service: &str, ready: &serde_json::Value) {
+        if let Some(address) = ready["http"].as_str() {
+            self.pages.push((service.to_owned(), address.to_owned()));
+        }
+    }
+
     /// Starts the commander, on its old address if it had one.
     pub fn start_commander(&mut self) {
-        let learner = format!("http://{}", self.learner_address);
-        let mut commander = Process::start(
-            &["commander", "--learner", &learner, "--listen", &self.commander_address],
-            &self.folder.path().join("commander.log"),
-        );
-        self.commander_address = commander.ready();
+        let learner =
+            self.wires.as_ref().map_or(self.learner_address.clone(), |wires| wires.commander_learner.address());
+        let learner = format!("http://{learner}");
+        let mut arguments = vec!["commander", "--learner", &learner, "--listen", &self.commander_address];
+        arguments.extend(self.extra.iter().map(String::as_str));
+        let mut commander = Process::start(&arguments, &self.folder.path().join("commander.log"));
+        let ready = commander.ready_line();
+        self.commander_address = ready["address"].as_str().expect("the commander's address").to_owned();
         self.commander = Some(commander);
+        self.note_page("commander", &ready);
     }
 
     /// Starts one more actor.
@@ -184,14 +269,26 @@ impl Cluster {
 
     /// Starts one more actor with extra options.
     pub fn start_actor_with(&mut self, extra: &[&str]) {
+        let learner = self.wires.as_ref().map_or(self.learner_address.clone(), |wires| wires.actors_learner.address());
+        self.start_actor_at(&learner, extra);
+    }
+
+    /// Starts one more actor that takes this for the learner's address.
+    pub fn start_actor_at(&mut self, learner: &str, extra: &[&str]) {
         self.started += 1;
-        let (learner, commander) =
-            (format!("http://{}", self.learner_address), format!("http://{}", self.commander_address));
+        let learner = format!("http://{learner}");
+        let commander =
+            self.wires.as_ref().map_or(self.commander_address.clone(), |wires| wires.actors_commander.address());
+        let commander = format!("http://{commander}");
         let name = format!("actor-{}", self.started);
         let mut arguments =
             vec!["actor", "--learner", &learner, "--commander", &commander, "--threads", "1", "--name", &name];
         arguments.extend(extra);
-        self.actors.push(Process::start(&arguments, &self.folder.path().join(format!("{name}.log"))));
+        arguments.extend(self.extra.iter().map(String::as_str));
+        let mut actor = Process::start(&arguments, &self.folder.path().join(format!("{name}.log")));
+        let ready = actor.ready_line();
+        self.actors.push(actor);
+        self.note_page("actor", &ready);
     }
 
     /// Starts the learner again from its checkpoint, on its old address.
@@ -208,7 +305,7 @@ impl Cluster {
                 "--threads",
                 "1",
                 "--lease-seconds",
-                LEASE,
+                &self.lease,
             ],
             &self.folder.path().join("learner.log"),
         );
@@ -218,7 +315,41 @@ impl Cluster {
 
     /// The run folder.
     pub fn run(&self) -> PathBuf {
-        self.folder.path().join("run")
+        self.run.clone()
+    }
+
+    /// What is between the processes.
+    pub fn wires(&self) -> &Wires {
+        self.wires.as_ref().expect("a cluster with proxies")
+    }
+
+    /// Where the learner listens.
+    pub fn learner_address(&self) -> &str {
+        &self.learner_address
+    }
+
+    /// How the learner says that the run stands, if it answers. Its ledger must balance, whenever one asks.
+    pub fn status(&self) -> Option<v1::RunStatus> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        let url = format!("http://{}", self.learner_address);
+        let asking = async {
+            let channel = client::endpoint(&url).expect("an address").connect().await.ok()?;
+            let answer = LearnerServiceClient::new(channel).get_run(v1::GetRunRequest {}).await.ok()?;
+            answer.into_inner().run
+        };
+        let status = runtime.block_on(async { tokio::time::timeout(Duration::from_secs(2), asking).await.ok()? })?;
+        let l = status.ledger.expect("a learner has a ledger");
+        let ended = l.trained + l.duplicate + l.expired + l.rejected + l.failed + l.outstanding;
+        assert_eq!(l.leased, ended, "every lease ends in exactly one way: {l:?}");
+        Some(status)
+    }
+
+    /// Waits until the learner is at this iteration.
+    pub fn wait_for_iteration(&self, iteration: u32) {
+        wait_until(&format!("iteration {iteration}"), || {
+            std::thread::sleep(Duration::from_millis(20));
+            self.status().is_some_and(|status| status.iteration >= iteration)
+        });
     }
 
     /// Where the commander listens.
@@ -239,6 +370,12 @@ impl Cluster {
         let summary: serde_json::Value = serde_json::from_str(&summary).expect("a summary in JSON");
         summary["weights_sha256"].as_str().expect("a hash").to_owned()
     }
+}
+
+/// An address that nobody listens on for now.
+fn free_address() -> String {
+    let socket = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    socket.local_addr().expect("its address").to_string()
 }
 
 fn text(path: &Path) -> String {

@@ -2,10 +2,16 @@
 //! processes is in `cluster.rs`.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+use magex::local::LocalCollector;
 use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::ids::{RunId, Shard};
 use magex_core::task::TaskName;
+use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint;
-use magex_learner::trainer::{Outcome, Trainer};
+use magex_learner::collector::{CollectError, Collector, RunEvent, StopReason};
+use magex_learner::metrics::Summary;
+use magex_learner::trainer::{EVAL_SET_TRAINING, Outcome, Trainer};
+use magex_proto::weights::Weights;
 use magex_tests::{drive, small, small_task, train, updates};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -165,4 +171,99 @@ fn it_learns() {
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 2, 2);
     let Outcome::Finished(summary) = ran.outcome else { panic!("not finished") };
     assert!(summary.success_rate > 0.9, "{summary:?}");
+}
+
+/// Where a run is interrupted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Interruption {
+    Never,
+    /// The plan of this number is not collected.
+    Plan(u32),
+    /// Told to stop while the plan of this number is collected.
+    Drain(u32),
+}
+
+/// A collector that is interrupted, and whose evaluations reach the target at these iterations only.
+struct Interrupted {
+    inner: LocalCollector,
+    reached: &'static [u32],
+    at: Interruption,
+    plans: u32,
+}
+
+impl Collector for Interrupted {
+    fn publish(&mut self, weights: &Arc<Weights>) -> Result<(), CollectError> {
+        self.inner.publish(weights)
+    }
+
+    fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError> {
+        self.plans += 1;
+        if self.at == Interruption::Plan(self.plans) {
+            return Err(CollectError::Stopped(StopReason::Shutdown));
+        }
+        let mut results = self.inner.collect(plan)?;
+        for result in &mut results {
+            if let ShardResult::Eval(outcome) = result
+                && outcome.shard.eval_set == EVAL_SET_TRAINING
+            {
+                let success = if self.reached.contains(&outcome.shard.iteration.0) { 1.0 } else { 0.0 };
+                outcome.metrics.iter_mut().for_each(|episode| episode.success = success);
+            }
+        }
+        Ok(results)
+    }
+
+    fn event(&mut self, event: RunEvent) {
+        self.inner.event(event);
+    }
+
+    fn stop_requested(&self) -> Option<StopReason> {
+        matches!(self.at, Interruption::Drain(plan) if plan <= self.plans).then(|| StopReason::Drain(String::new()))
+    }
+}
+
+/// What a run comes to, how it ended and after how many plans.
+fn interrupted(
+    mut trainer: Trainer,
+    config: &RunConfig,
+    reached: &'static [u32],
+    at: Interruption,
+) -> (Option<Summary>, u32) {
+    let never = Arc::new(AtomicBool::new(false));
+    let inner = LocalCollector::new(config, 1, std::sync::mpsc::channel().0, never);
+    let mut collector = Interrupted { inner, reached, at, plans: 0 };
+    match trainer.run(&mut collector).unwrap() {
+        // The only number that a clock may reach.
+        Outcome::Finished(summary) => (Some(Summary { wall_s: 0.0, ..*summary }), collector.plans),
+        Outcome::Stopped(_) => (None, collector.plans),
+    }
+}
+
+#[test]
+fn a_run_that_is_interrupted_anywhere_comes_to_what_an_undisturbed_one_comes_to() {
+    let mut config = small(ExecutorKind::Local, 5, 4);
+    config.run.target_success = 0.9;
+    // Evaluations are at 0, 2 and 4, where the budget is spent.
+    let cases: [(&[u32], bool, u32); 4] =
+        [(&[4], false, 4), (&[2, 4], true, 4), (&[0, 2], true, 2), (&[0, 4], false, 4)];
+    for (reached, target_reached, iterations) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        let trainer = Trainer::create(&config, RunId("r".into()), folder.path(), 1).unwrap();
+        let (undisturbed, plans) = interrupted(trainer, &config, reached, Interruption::Never);
+        let expected = undisturbed.unwrap();
+        assert_eq!((expected.target_reached, expected.iterations), (target_reached, iterations), "{reached:?}");
+        for at in (1..=plans).flat_map(|plan| [Interruption::Plan(plan), Interruption::Drain(plan)]) {
+            let folder = tempfile::tempdir().unwrap();
+            let trainer = Trainer::create(&config, RunId("r".into()), folder.path(), 1).unwrap();
+            let summary = match interrupted(trainer, &config, reached, at).0 {
+                Some(summary) => summary,
+                None => {
+                    let (trainer, skipped) = Trainer::resume(&config, folder.path(), 1).unwrap();
+                    assert!(skipped.is_empty());
+                    interrupted(trainer, &config, reached, Interruption::Never).0.unwrap()
+                }
+            };
+            assert_eq!(summary, expected, "{reached:?} interrupted at {at:?}");
+        }
+    }
 }

@@ -91,6 +91,26 @@ fn sources(folder: &Path, out: &mut Vec<PathBuf>) {
 }
 
 #[test]
+fn what_is_there_in_two_versions_is_known() {
+    let lock = std::fs::read_to_string(root().join("Cargo.lock")).unwrap();
+    let mut versions = BTreeMap::<&str, usize>::new();
+    for name in lock.lines().filter_map(|line| line.strip_prefix("name = ")) {
+        *versions.entry(name.trim_matches('"')).or_default() += 1;
+    }
+    let twice: BTreeSet<&str> = versions.iter().filter(|(_, count)| **count > 1).map(|(name, _)| *name).collect();
+    let text = std::fs::read_to_string(root().join("docs/dependencies.md")).unwrap();
+    let rows = text.split("## In more than one version").nth(1).unwrap().lines().filter(|line| line.starts_with("| `"));
+    let known: BTreeSet<&str> =
+        rows.flat_map(|row| row.split('|').nth(1).unwrap_or("").split('`').skip(1).step_by(2)).collect();
+    let (new, gone) = (twice.difference(&known), known.difference(&twice));
+    let (new, gone): (Vec<_>, Vec<_>) = (new.collect(), gone.collect());
+    assert!(
+        new.is_empty() && gone.is_empty(),
+        "docs/dependencies.md: in more than one version, not listed: {new:?}; listed, no longer so: {gone:?}"
+    );
+}
+
+#[test]
 fn files_stay_readable_and_mains_stay_short() {
     let mut files = Vec::new();
     sources(&root(), &mut files);

@@ -79,15 +79,12 @@ impl BottleneckSolver {
         values.dedup();
         let pairs = match none_forbidden {
             true => rows.min(cols),
-            false => matcher.run(cost, rows, cols, values[values.len() - 1]),
+            false => matcher.run(cost, rows, cols, values[values.len() - 1], go_on)?,
         };
         let (mut low, mut high) = (0, values.len() - 1);
         while low < high {
-            if !go_on() {
-                return Err(AssignError::Interrupted);
-            }
             let middle = low + (high - low) / 2;
-            if matcher.run(cost, rows, cols, values[middle]) == pairs {
+            if matcher.run(cost, rows, cols, values[middle], go_on)? == pairs {
                 high = middle;
             } else {
                 low = middle + 1;
@@ -101,7 +98,7 @@ impl BottleneckSolver {
         if assignment.pairs().count() == pairs {
             return Ok(Bottleneck { assignment, largest });
         }
-        matcher.run(cost, rows, cols, largest);
+        matcher.run(cost, rows, cols, largest, go_on)?;
         let col_of_row = matcher.col_of_row.clone();
         let sum = cost_of(cost, cols, &col_of_row);
         Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
@@ -124,8 +121,18 @@ pub(crate) struct Matcher {
 }
 
 impl Matcher {
-    /// Size of the largest matching.
-    pub(crate) fn run(&mut self, cost: &[f64], rows: usize, cols: usize, threshold: f64) -> usize {
+    /// Size of the largest matching. `go_on` is asked before every round of paths of the same length.
+    pub(crate) fn run(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        threshold: f64,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<usize, AssignError> {
+        if !go_on() {
+            return Err(AssignError::Interrupted);
+        }
         self.edges.clear();
         self.start.clear();
         self.start.push(0);
@@ -139,6 +146,9 @@ impl Matcher {
         self.row_of_col.resize(cols, NONE);
         let mut matched = 0;
         while self.layers(rows) {
+            if !go_on() {
+                return Err(AssignError::Interrupted);
+            }
             self.cursor.clear();
             self.cursor.extend_from_slice(&self.start[..rows]);
             for row in 0..rows as u32 {
@@ -147,7 +157,7 @@ impl Matcher {
                 }
             }
         }
-        matched
+        Ok(matched)
     }
 
     /// Breadth-first layers of rows from the free ones; true if a free column can be reached.

@@ -11,6 +11,7 @@
 //! and the exponential and the logarithm are polynomials of this file.
 
 use crate::{AssignError, check_shape};
+use wide::f32x16;
 
 const LANES: usize = 16;
 /// Exponents are kept above this, so that a starved column still has a sum to be divided by.
@@ -29,15 +30,27 @@ pub struct Schedule {
     pub last: f32,
     /// Stages; ε falls by the same factor from one to the next.
     pub stages: usize,
-    /// Sinkhorn rounds (rows, then columns) per stage.
+    /// Most Sinkhorn rounds (rows, then columns) per stage.
     pub rounds: usize,
+    /// A stage ends early when every column of the plan is within this share of its mass.
+    pub tolerance: f32,
 }
 
 impl Default for Schedule {
     fn default() -> Self {
-        Self { first: 0.1, last: 0.001, stages: 12, rounds: 16 }
+        Self { first: 0.1, last: 0.0003, stages: 12, rounds: 128, tolerance: 0.05 }
     }
 }
+
+impl Schedule {
+    /// For a problem of so many pairs: those too large to converge in a fraction of a second get fewer rounds.
+    pub fn for_pairs(pairs: usize) -> Self {
+        Self { rounds: (ROUND_PAIRS / pairs.max(1)).clamp(16, 128), ..Self::default() }
+    }
+}
+
+/// Pairs times rounds that a stage may take.
+const ROUND_PAIRS: usize = 64_000_000;
 
 /// The potentials of a problem.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,11 +86,10 @@ pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize, schedule: &Schedul
         if schedule.stages > 1 { ln(schedule.last / schedule.first) / (schedule.stages - 1) as f32 } else { 0.0 };
     for stage in 0..schedule.stages {
         let left = (schedule.stages - 1 - stage) as f32;
-        sinkhorn.stage(schedule.last * exp(-fall * left), schedule.rounds);
+        sinkhorn.stage(schedule.last * exp(-fall * left), schedule.rounds, schedule.tolerance);
     }
-    sinkhorn.col_price.truncate(cols);
-    let in_units = |prices: Vec<f32>| prices.into_iter().map(|price| price * unit).collect();
-    Ok(Duals { rows: in_units(sinkhorn.row_price), cols: in_units(sinkhorn.col_price) })
+    let in_units = |prices: &[f32]| prices.iter().map(|price| price * unit).collect();
+    Ok(Duals { rows: in_units(&sinkhorn.by_col.price[..rows]), cols: in_units(&sinkhorn.by_row.price[..cols]) })
 }
 
 fn check(cost: &[f32], rows: usize, cols: usize, schedule: &Schedule) -> Result<(), AssignError> {
@@ -96,6 +108,10 @@ fn check(cost: &[f32], rows: usize, cols: usize, schedule: &Schedule) -> Result<
             return Err(AssignError::Parameter { field, value: f64::from(value), remedy });
         }
     }
+    if !(0.0..=1.0).contains(&schedule.tolerance) {
+        let value = f64::from(schedule.tolerance);
+        return Err(AssignError::Parameter { field: "schedule.tolerance", value, remedy: "use a share from 0 to 1" });
+    }
     for (field, value) in [("schedule.stages", schedule.stages), ("schedule.rounds", schedule.rounds)] {
         if !(1..=100_000).contains(&value) {
             return Err(AssignError::Parameter { field, value: value as f64, remedy: "use 1 to 100000" });
@@ -104,91 +120,171 @@ fn check(cost: &[f32], rows: usize, cols: usize, schedule: &Schedule) -> Result<
     Ok(())
 }
 
-/// Costs and potentials in units of the mean cost; columns padded to whole lanes.
+/// Costs and potentials in units of the mean cost. Kernel and costs are kept twice, once by rows and once by columns, so
+/// that row sums and column sums are both sums of weighted vectors: no sum runs across the lanes of a vector.
 struct Sinkhorn {
+    /// Rows and columns.
+    shape: (usize, usize),
+    by_row: Side,
+    by_col: Side,
+    /// `[rows]`, padded.
+    best: Vec<f32>,
+}
+
+/// One orientation: a matrix [members, others], and what belongs to its others.
+struct Side {
+    /// Others, padded to whole lanes.
     stride: usize,
-    cols: usize,
-    /// rows / cols, the sum of every column of the plan.
-    col_mass: f32,
-    /// `[rows, stride]`
+    /// `[members, stride]`
     cost: Vec<f32>,
-    /// `[rows, stride]` exp((u + v − c) / ε) with the potentials at the start of the stage.
+    /// `[members, stride]` exp((u + v − c) / ε) with the potentials at the start of the stage; 0 in the padding.
     kernel: Vec<f32>,
-    row_price: Vec<f32>,
-    col_price: Vec<f32>,
-    row_scale: Vec<f32>,
-    col_scale: Vec<f32>,
-    col_sum: Vec<f32>,
+    /// `[stride]` potentials of the others.
+    price: Vec<f32>,
+    /// `[stride]` scalings of the others.
+    scale: Vec<f32>,
+    /// `[stride]`
+    sum: Vec<f32>,
+}
+
+impl Side {
+    fn new(members: usize, others: usize, cost: impl Fn(usize, usize) -> f32) -> Self {
+        let stride = others.next_multiple_of(LANES);
+        let mut padded = vec![0.0; members * stride];
+        for (member, row) in padded.chunks_exact_mut(stride).enumerate() {
+            for (other, slot) in row[..others].iter_mut().enumerate() {
+                *slot = cost(member, other);
+            }
+        }
+        let zeros = vec![0.0; stride];
+        let kernel = vec![0.0; members * stride];
+        Self { stride, cost: padded, kernel, price: zeros.clone(), scale: zeros.clone(), sum: zeros }
+    }
 }
 
 impl Sinkhorn {
     fn new(cost: &[f32], rows: usize, cols: usize, unit: f32) -> Self {
-        let stride = cols.next_multiple_of(LANES);
-        let mut padded = vec![0.0; rows * stride];
-        for (padded, costs) in padded.chunks_exact_mut(stride).zip(cost.chunks_exact(cols)) {
-            for (slot, cost) in padded.iter_mut().zip(costs) {
-                *slot = cost / unit;
-            }
-        }
-        Self {
-            stride,
-            cols,
-            col_mass: rows as f32 / cols as f32,
-            cost: padded,
-            kernel: vec![0.0; rows * stride],
-            row_price: vec![0.0; rows],
-            col_price: vec![0.0; stride],
-            row_scale: vec![1.0; rows],
-            col_scale: vec![0.0; stride],
-            col_sum: vec![0.0; stride],
-        }
+        let by_row = Side::new(rows, cols, |row, col| cost[row * cols + col] / unit);
+        let by_col = Side::new(cols, rows, |col, row| cost[row * cols + col] / unit);
+        let best = vec![0.0; by_col.stride];
+        Self { shape: (rows, cols), by_row, by_col, best }
     }
 
-    /// One ε: the kernel from the current potentials, `rounds` of scaling, absorption.
-    fn stage(&mut self, epsilon: f32, rounds: usize) {
+    /// Scales the rows to sum 1, then the columns to rows / cols; how far the columns were from that. `correct` turns
+    /// (scale, wanted sum / present sum) into the new scale.
+    #[inline(always)]
+    fn round(
+        by_row: &mut Side,
+        by_col: &mut Side,
+        (rows, cols): (usize, usize),
+        correct: impl Fn(f32, f32) -> f32 + Copy,
+    ) -> f32 {
+        weighted_sum(&by_col.kernel, by_col.stride, &by_row.scale[..cols], &mut by_col.sum);
+        rescale(&mut by_col.scale, &mut by_col.sum, rows, 1.0, correct);
+        weighted_sum(&by_row.kernel, by_row.stride, &by_col.scale[..rows], &mut by_row.sum);
+        rescale(&mut by_row.scale, &mut by_row.sum, cols, rows as f32 / cols as f32, correct)
+    }
+
+    /// One ε: the kernel from the current potentials, rounds of scaling until the columns are within `tolerance` of their
+    /// mass or there were `rounds`, absorption.
+    fn stage(&mut self, epsilon: f32, rounds: usize, tolerance: f32) {
+        let Self { shape, by_row, by_col, best } = self;
+        let shape @ (rows, cols) = *shape;
         let rate = 1.0 / epsilon;
-        for (row, (kernel, costs)) in
-            self.kernel.chunks_exact_mut(self.stride).zip(self.cost.chunks_exact(self.stride)).enumerate()
-        {
-            let best = row_exponents(costs, &self.col_price, rate, self.cols, kernel);
+        let lines = by_row.kernel.chunks_exact_mut(by_row.stride).zip(by_row.cost.chunks_exact(by_row.stride));
+        for ((kernel, costs), best) in lines.zip(best.iter_mut()) {
+            *best = row_exponents(costs, &by_row.price, rate, cols, kernel);
             for value in kernel.iter_mut() {
-                *value = exp(maximum(*value - best, FLOOR));
+                *value = exp(maximum(*value - *best, FLOOR));
             }
-            kernel[self.cols..].fill(0.0);
-            self.row_price[row] = -best * epsilon;
+            kernel[cols..].fill(0.0);
         }
-        self.row_scale.fill(1.0);
-        self.col_scale[..self.cols].fill(1.0);
+        let lines = by_col.kernel.chunks_exact_mut(by_col.stride).zip(by_col.cost.chunks_exact(by_col.stride));
+        for ((kernel, costs), &price) in lines.zip(&by_row.price) {
+            for ((value, &cost), &best) in kernel.iter_mut().zip(costs).zip(best.iter()) {
+                *value = exp(maximum((price - cost) * rate - best, FLOOR));
+            }
+            kernel[rows..].fill(0.0);
+        }
+        for (price, &best) in by_col.price[..rows].iter_mut().zip(best.iter()) {
+            *price = -best * epsilon;
+        }
+        by_col.scale.fill(1.0);
+        by_row.scale.fill(1.0);
         for round in 0..rounds {
             // The first round repairs what the smaller ε broke, by any factor; the others accelerate.
-            if round == 0 {
-                self.round(plain);
+            let worst = if round == 0 {
+                Self::round(by_row, by_col, shape, plain)
             } else {
-                self.round(relaxed);
+                Self::round(by_row, by_col, shape, relaxed)
+            };
+            if worst < tolerance {
+                break;
             }
         }
-        for (price, &scale) in self.row_price.iter_mut().zip(&self.row_scale) {
-            *price = epsilon.mul_add(ln(scale), *price);
-        }
-        for (price, &scale) in self.col_price[..self.cols].iter_mut().zip(&self.col_scale) {
-            *price = epsilon.mul_add(ln(scale), *price);
+        for (side, count) in [(by_col, rows), (by_row, cols)] {
+            for (price, &scale) in side.price[..count].iter_mut().zip(&side.scale) {
+                *price = epsilon.mul_add(ln(scale), *price);
+            }
         }
     }
+}
 
-    /// Scales the rows to sum 1, then the columns to their mass, in one pass over the kernel. `correct` turns
-    /// (scale, wanted sum / present sum) into the new scale.
-    fn round(&mut self, correct: impl Fn(f32, f32) -> f32) {
-        self.col_sum.fill(0.0);
-        for (kernel, scale) in self.kernel.chunks_exact(self.stride).zip(&mut self.row_scale) {
-            *scale = correct(*scale, 1.0 / (dot(kernel, &self.col_scale) * *scale));
-            for (sum, &value) in self.col_sum.iter_mut().zip(kernel) {
-                *sum = value.mul_add(*scale, *sum);
-            }
-        }
-        for (scale, &sum) in self.col_scale[..self.cols].iter_mut().zip(&self.col_sum) {
-            *scale = correct(*scale, self.col_mass / (sum * *scale));
+/// Scales towards sums of `mass` and returns the largest |mass / sum − 1| before that.
+#[inline(always)]
+fn rescale(scales: &mut [f32], sums: &mut [f32], count: usize, mass: f32, correct: impl Fn(f32, f32) -> f32) -> f32 {
+    // The padding has its mass and stays as it is.
+    sums[count..].fill(mass);
+    let mut worst = [0.0; LANES];
+    for (scales, sums) in scales.as_chunks_mut::<LANES>().0.iter_mut().zip(sums.as_chunks::<LANES>().0) {
+        for lane in 0..LANES {
+            let ratio = mass / (sums[lane] * scales[lane]);
+            worst[lane] = maximum((ratio - 1.0).abs(), worst[lane]);
+            scales[lane] = correct(scales[lane], ratio);
         }
     }
+    worst.into_iter().fold(0.0, maximum)
+}
+
+/// Σ of the rows of `matrix` [members, stride] times their weights.
+fn weighted_sum(matrix: &[f32], stride: usize, weights: &[f32], out: &mut [f32]) {
+    let mut start = 0;
+    while start < stride {
+        start += match (stride - start) / LANES {
+            8.. => panel::<8>(matrix, stride, start, weights, out),
+            4..8 => panel::<4>(matrix, stride, start, weights, out),
+            2..4 => panel::<2>(matrix, stride, start, weights, out),
+            _ => panel::<1>(matrix, stride, start, weights, out),
+        };
+    }
+}
+
+/// The same for Q vectors of columns from `start` on, odd and even rows apart to keep the adders busy; returns the columns done.
+#[inline(always)]
+fn panel<const Q: usize>(matrix: &[f32], stride: usize, start: usize, weights: &[f32], out: &mut [f32]) -> usize {
+    let width = Q * LANES;
+    let (mut even, mut odd) = ([f32x16::ZERO; Q], [f32x16::ZERO; Q]);
+    let values = |row: usize| matrix[row * stride + start..][..width].as_chunks::<LANES>().0;
+    let (pairs, rest) = weights.as_chunks::<2>();
+    for (pair, weight) in pairs.iter().enumerate() {
+        let (first, second) = (values(2 * pair), values(2 * pair + 1));
+        let weight = weight.map(f32x16::splat);
+        // Indices: this loop must be unrolled whatever the optimiser thinks of iterators.
+        for q in 0..Q {
+            even[q] = f32x16::new(first[q]).mul_add(weight[0], even[q]);
+            odd[q] = f32x16::new(second[q]).mul_add(weight[1], odd[q]);
+        }
+    }
+    if let Some(&weight) = rest.first() {
+        let last = values(weights.len() - 1);
+        for q in 0..Q {
+            even[q] = f32x16::new(last[q]).mul_add(f32x16::splat(weight), even[q]);
+        }
+    }
+    for ((out, even), odd) in out[start..start + width].as_chunks_mut::<LANES>().0.iter_mut().zip(even).zip(odd) {
+        *out = (even + odd).to_array();
+    }
+    width
 }
 
 /// Sinkhorn's own step.
@@ -196,10 +292,11 @@ fn plain(scale: f32, ratio: f32) -> f32 {
     clamp(scale * ratio, LARGEST_SCALE)
 }
 
-/// The step taken one and a half times: ratio^1.5 (Thibault et al. 2017, "Overrelaxed Sinkhorn–Knopp").
+/// The step taken one and three quarter times: ratio^1.75 (Thibault et al. 2017, "Overrelaxed Sinkhorn–Knopp").
 fn relaxed(scale: f32, ratio: f32) -> f32 {
     let ratio = clamp(ratio, LARGEST_STEP);
-    clamp(scale * (ratio * ratio.sqrt()), LARGEST_SCALE)
+    let root = ratio.sqrt();
+    clamp(scale * (ratio * root * root.sqrt()), LARGEST_SCALE)
 }
 
 fn clamp(value: f32, largest: f32) -> f32 {
@@ -219,23 +316,6 @@ fn row_exponents(costs: &[f32], prices: &[f32], rate: f32, cols: usize, out: &mu
         }
     }
     best.into_iter().fold(f32::MIN, maximum)
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let mut sums = [0.0f32; LANES];
-    for (a, b) in a.as_chunks::<LANES>().0.iter().zip(b.as_chunks::<LANES>().0) {
-        for lane in 0..LANES {
-            sums[lane] = a[lane].mul_add(b[lane], sums[lane]);
-        }
-    }
-    let mut width = LANES / 2;
-    while width > 0 {
-        for lane in 0..width {
-            sums[lane] += sums[lane + width];
-        }
-        width /= 2;
-    }
-    sums[0]
 }
 
 // Comparisons instead of f32::max / min: one instruction, and NaN cannot occur here.

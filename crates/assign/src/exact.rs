@@ -9,7 +9,11 @@
 //! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
 //! lowest index, free columns first: the answer is a function of the input alone.
 
+mod shortlist;
+
 use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, compensated_sum, distances_into};
+
+use shortlist::{Shortlists, WORTH_IT};
 
 const NONE: u32 = u32::MAX;
 /// Columns are padded to whole groups of this size; each scan keeps this many independent minima.
@@ -18,7 +22,7 @@ const LANES: usize = 8;
 /// The solver's memory. Reusing one solver allocates nothing but the answers.
 #[derive(Debug, Clone, Default)]
 pub struct Solver {
-    /// `[rows, stride]` with rows ≤ cols ≤ stride; +∞ in the padding.
+    /// `[rows, stride]` with rows ≤ cols ≤ stride; +∞ in the padding. Not used for costs that have this form as they are.
     cost: Vec<f64>,
     stride: usize,
     /// `[stride]` dual price of each column.
@@ -36,6 +40,11 @@ pub struct Solver {
     free: Vec<u32>,
     still_free: Vec<u32>,
     points: Vec<f64>,
+    shortlists: Shortlists,
+    /// Columns from which on there are shortlists, if not the usual number.
+    pub(crate) lists_from: Option<usize>,
+    /// Rows of the tree of which only the shortlist was looked at: index in the tree, and what the rest cannot undercut.
+    unread: Vec<(usize, f64)>,
 }
 
 /// A row of the shortest-path tree.
@@ -99,8 +108,16 @@ impl Solver {
         go_on: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
         let wide = rows <= cols;
-        self.load(cost, rows, cols, penalty);
-        self.run(rows.min(cols), rows.max(cols), go_on)?;
+        let mut own = std::mem::take(&mut self.cost);
+        self.stride = rows.max(cols).next_multiple_of(LANES);
+        // A copy of a large matrix would take as long as a good part of the solution.
+        let as_it_is = wide && self.stride == cols && penalty.is_none();
+        if !as_it_is {
+            load(&mut own, self.stride, cost, rows, cols, penalty);
+        }
+        let solved = self.run(if as_it_is { cost } else { &own }, rows.min(cols), rows.max(cols), go_on);
+        self.cost = own;
+        solved?;
         let mut col_of_row: Vec<u32> = if wide {
             self.col_of_row.clone()
         } else {
@@ -130,28 +147,7 @@ impl Solver {
         answer
     }
 
-    /// Copies the costs, transposed if there are more rows than columns, and pads every row. Forbidden pairs get a price.
-    fn load(&mut self, cost: &[f64], rows: usize, cols: usize, penalty: Option<f64>) {
-        let (short, long) = (rows.min(cols), rows.max(cols));
-        self.stride = long.next_multiple_of(LANES);
-        self.cost.clear();
-        self.cost.reserve(short * self.stride);
-        for row in 0..short {
-            if rows <= cols {
-                self.cost.extend_from_slice(&cost[row * cols..(row + 1) * cols]);
-            } else {
-                self.cost.extend((0..rows).map(|i| cost[i * cols + row]));
-            }
-            if let Some(penalty) = penalty {
-                for value in &mut self.cost[row * self.stride..] {
-                    *value = if *value == f64::INFINITY { penalty } else { *value };
-                }
-            }
-            self.cost.resize((row + 1) * self.stride, f64::INFINITY);
-        }
-    }
-
-    fn run(&mut self, rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    fn run(&mut self, cost: &[f64], rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<(), AssignError> {
         let stride = self.stride;
         refill(&mut self.price, stride, 0.0);
         refill(&mut self.row_of_col, stride, NONE);
@@ -162,31 +158,35 @@ impl Solver {
             return Ok(());
         }
         if rows == cols {
-            self.reduce_columns(cols);
+            self.reduce_columns(cost, cols);
         }
         self.free.clear();
         self.free.extend((0..rows as u32).filter(|&row| self.col_of_row[row as usize] == NONE));
-        self.reduce_rows(rows);
+        self.reduce_rows(cost, rows);
+        if self.listed(cols) {
+            self.shortlists.reset(rows);
+        }
         for next in 0..self.free.len() {
             if !go_on() {
                 return Err(AssignError::Interrupted);
             }
-            self.augment(self.free[next]);
+            self.augment(cost, cols, self.free[next]);
         }
         Ok(())
     }
 
     /// Gives back the memory of a problem of more than `cells` pairs.
     pub fn forget_beyond(&mut self, cells: usize) {
-        if self.cost.capacity() > cells {
+        let large = self.price.len() * self.col_of_row.len() > cells;
+        if large || self.cost.capacity() > cells {
             *self = Self::default();
         }
     }
 
     /// Column reduction: each column takes the price of its cheapest row, and the row if nobody has it yet. Then the
     /// reduction transfer: a row chosen by one column only lowers that column's price as far as it stays its best.
-    fn reduce_columns(&mut self, cols: usize) {
-        let Self { cost, stride, price, cheapest, row_of_col, col_of_row, still_free, .. } = self;
+    fn reduce_columns(&mut self, cost: &[f64], cols: usize) {
+        let Self { stride, price, cheapest, row_of_col, col_of_row, still_free, .. } = self;
         price.copy_from_slice(&cost[..*stride]);
         refill(cheapest, *stride, 0);
         for (row, costs) in cost.chunks_exact(*stride).enumerate().skip(1) {
@@ -219,8 +219,8 @@ impl Solver {
 
     /// Augmenting row reduction over the free rows: each takes its cheapest column at a price that makes the second
     /// cheapest as good, and displaces the owner, who looks for another column at once.
-    fn reduce_rows(&mut self, rows: usize) {
-        let Self { cost, stride, price, row_of_col, col_of_row, free, still_free, .. } = self;
+    fn reduce_rows(&mut self, cost: &[f64], rows: usize) {
+        let Self { stride, price, row_of_col, col_of_row, free, still_free, .. } = self;
         still_free.clear();
         let mut budget = 4 * rows;
         for &first in free.iter() {
@@ -253,10 +253,15 @@ impl Solver {
         std::mem::swap(free, still_free);
     }
 
+    fn listed(&self, cols: usize) -> bool {
+        cols >= self.lists_from.unwrap_or(WORTH_IT)
+    }
+
     /// Finds the shortest alternating path from a free row to a free column, reprices the columns of the tree and
     /// flips the path.
-    fn augment(&mut self, start: u32) {
-        let Self { cost, stride, price, open_price, distance, tree, row_of_col, col_of_row, .. } = self;
+    fn augment(&mut self, cost: &[f64], cols: usize, start: u32) {
+        let listed = self.listed(cols);
+        let Self { stride, price, open_price, distance, tree, row_of_col, col_of_row, shortlists, unread, .. } = self;
         let stride = *stride;
         open_price.clear();
         open_price.extend_from_slice(price);
@@ -264,9 +269,36 @@ impl Solver {
         tree.clear();
         tree.push(Branch { row: start, offset: 0.0, col: NONE, length: 0.0 });
         let (mut row, mut offset) = (start, 0.0);
+        let costs_of = |row: u32| &cost[row as usize * stride..(row as usize + 1) * stride];
+        // No path to a column that was not looked at is shorter than this.
+        let mut bound = f64::INFINITY;
+        unread.clear();
         let (end, shortest) = loop {
-            let costs = &cost[row as usize * stride..(row as usize + 1) * stride];
-            let nearest = relax(costs, open_price, offset, distance);
+            let listed_bound = if listed { shortlists.relax(row, open_price, offset, distance) } else { None };
+            let mut nearest = match listed_bound {
+                Some(rest) => {
+                    unread.push((tree.len() - 1, rest));
+                    bound = lower(rest, bound);
+                    least(distance)
+                }
+                None => {
+                    let nearest = relax(costs_of(row), open_price, offset, distance);
+                    if listed {
+                        shortlists.make(row, costs_of(row), price, cols);
+                    }
+                    nearest
+                }
+            };
+            while nearest >= bound {
+                let mut first = 0;
+                for (place, &(_, rest)) in unread.iter().enumerate() {
+                    first = if rest < unread[first].1 { place } else { first };
+                }
+                let Branch { row, offset, .. } = tree[unread.swap_remove(first).0];
+                nearest = relax(costs_of(row), open_price, offset, distance);
+                shortlists.make(row, costs_of(row), price, cols);
+                bound = unread.iter().fold(f64::INFINITY, |bound, &(_, rest)| lower(rest, bound));
+            }
             let col = nearest_column(distance, nearest, row_of_col);
             if row_of_col[col] == NONE {
                 break (col, nearest);
@@ -296,6 +328,26 @@ impl Solver {
         for branch in &tree[1..] {
             price[branch.col as usize] += branch.length - shortest;
         }
+    }
+}
+
+/// Copies the costs, transposed if there are more rows than columns, and pads every row. Forbidden pairs get a price.
+fn load(own: &mut Vec<f64>, stride: usize, cost: &[f64], rows: usize, cols: usize, penalty: Option<f64>) {
+    let short = rows.min(cols);
+    own.clear();
+    own.reserve(short * stride);
+    for row in 0..short {
+        if rows <= cols {
+            own.extend_from_slice(&cost[row * cols..(row + 1) * cols]);
+        } else {
+            own.extend((0..rows).map(|i| cost[i * cols + row]));
+        }
+        if let Some(penalty) = penalty {
+            for value in &mut own[row * stride..] {
+                *value = if *value == f64::INFINITY { penalty } else { *value };
+            }
+        }
+        own.resize((row + 1) * stride, f64::INFINITY);
     }
 }
 
@@ -363,6 +415,17 @@ fn relax(costs: &[f64], open_price: &[f64], offset: f64, distance: &mut [f64]) -
         width /= 2;
     }
     nearest[0]
+}
+
+/// The least length.
+fn least(distance: &[f64]) -> f64 {
+    let mut nearest = [f64::INFINITY; LANES];
+    for distance in distance.as_chunks::<LANES>().0 {
+        for lane in 0..LANES {
+            nearest[lane] = lower(distance[lane], nearest[lane]);
+        }
+    }
+    nearest.into_iter().fold(f64::INFINITY, lower)
 }
 
 /// The smaller one, as one instruction (f64::min would also look for NaN, which cannot occur here).

@@ -2,6 +2,9 @@
 
 use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cost_of};
 
+/// Pairs that are sorted at once.
+const CHUNK: usize = 1 << 16;
+
 /// Takes the cheapest remaining pair until one side is used up; ties go to the lowest (row, column). `cost` is
 /// row-major `[rows, cols]`.
 ///
@@ -9,38 +12,60 @@ use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cos
 /// As [`crate::Solver::solve`].
 pub fn greedy(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
     check_costs(cost, rows, cols)?;
-    Ok(take(cost, rows, cols))
+    take(cost, rows, cols, &|| true)
 }
 
-/// The same where a cost of +∞ forbids a pair. It may end with fewer pairs than are possible.
+/// The same where a cost of +∞ forbids a pair. It may end with fewer pairs than are possible. Gives up as soon as `go_on`
+/// says no.
 ///
 /// # Errors
 /// As [`crate::Solver::solve_allowed`].
-pub fn greedy_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+pub fn greedy_allowed(
+    cost: &[f64],
+    rows: usize,
+    cols: usize,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
     check_allowed(cost, rows, cols)?;
-    Ok(take(cost, rows, cols))
+    take(cost, rows, cols, go_on)
 }
 
-fn take(cost: &[f64], rows: usize, cols: usize) -> Assignment {
+fn take(cost: &[f64], rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<Assignment, AssignError> {
     let allowed = cost.iter().enumerate().filter(|&(_, &value)| value < f64::INFINITY);
     let mut order: Vec<(u64, u64)> = allowed.map(|(place, &value)| (ascending(value), place as u64)).collect();
-    order.sort_unstable();
     let mut col_of_row = vec![UNASSIGNED; rows];
     let mut taken = vec![false; cols];
     let mut left = rows.min(cols);
-    for (_, place) in order {
-        let (row, col) = (place as usize / cols, place as usize % cols);
-        if col_of_row[row] == UNASSIGNED && !taken[col] {
-            col_of_row[row] = col as u32;
-            taken[col] = true;
-            left -= 1;
-            if left == 0 {
-                break;
+    // Put in order as far as it is needed: `ends` are places before which everything is smaller than behind them.
+    let (mut start, mut ends) = (0, vec![order.len()]);
+    while let Some(&end) = ends.last() {
+        if left == 0 {
+            break;
+        }
+        // What is small is there sooner than anybody could be asked.
+        if order.len() > CHUNK && !go_on() {
+            return Err(AssignError::Interrupted);
+        }
+        if end - start > CHUNK {
+            let middle = (end - start) / 2;
+            order[start..end].select_nth_unstable(middle);
+            ends.push(start + middle);
+            continue;
+        }
+        order[start..end].sort_unstable();
+        for &(_, place) in &order[start..end] {
+            let (row, col) = (place as usize / cols, place as usize % cols);
+            if left > 0 && col_of_row[row] == UNASSIGNED && !taken[col] {
+                col_of_row[row] = col as u32;
+                taken[col] = true;
+                left -= 1;
             }
         }
+        start = end;
+        ends.pop();
     }
     let cost = cost_of(cost, cols, &col_of_row);
-    Assignment { col_of_row, cost }
+    Ok(Assignment { col_of_row, cost })
 }
 
 /// Bits that sort like the finite number they come from; −0 sorts as +0.

@@ -184,18 +184,40 @@ pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Sp
         return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
     }
     let mut span = Span { forbidden: 0, least: f64::INFINITY, largest: f64::NEG_INFINITY };
-    for (place, &value) in cost.iter().enumerate() {
-        if usable(value) {
-            span.least = span.least.min(value);
-            span.largest = span.largest.max(value);
-        } else if value == f64::INFINITY {
-            span.forbidden += 1;
-        } else {
-            return Err(AssignError::Entry { row: place / cols, col: place % cols, value });
+    for (block, values) in cost.chunks(BLOCK).enumerate() {
+        let lower = |a: f64, b: f64| if b < a { b } else { a };
+        let higher = |a: f64, b: f64| if b > a { b } else { a };
+        // Without a branch per entry, this and the count are vectors.
+        if values.iter().filter(|&&value| !usable(value)).count() == 0 {
+            let (mut least, mut largest) = ([f64::INFINITY; 8], [f64::NEG_INFINITY; 8]);
+            let (chunks, rest) = values.as_chunks::<8>();
+            for values in chunks {
+                for lane in 0..8 {
+                    least[lane] = lower(least[lane], values[lane]);
+                    largest[lane] = higher(largest[lane], values[lane]);
+                }
+            }
+            span.least = least.iter().chain(rest).copied().fold(span.least, lower);
+            span.largest = largest.iter().chain(rest).copied().fold(span.largest, higher);
+            continue;
+        }
+        for (place, &value) in values.iter().enumerate() {
+            if usable(value) {
+                span.least = lower(span.least, value);
+                span.largest = higher(span.largest, value);
+            } else if value == f64::INFINITY {
+                span.forbidden += 1;
+            } else {
+                let place = block * BLOCK + place;
+                return Err(AssignError::Entry { row: place / cols, col: place % cols, value });
+            }
         }
     }
     Ok(span)
 }
+
+/// Entries that are checked together.
+const BLOCK: usize = 1024;
 
 /// False for NaN too.
 fn usable(cost: f64) -> bool {

@@ -22,10 +22,17 @@ pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>,
 }
 
 /// A random matching of as many pairs as possible where a cost of +∞ forbids a pair; uniform only if none is forbidden.
+/// Gives up as soon as `go_on` says no.
 ///
 /// # Errors
 /// As [`crate::Solver::solve_allowed`].
-pub fn random_allowed(cost: &[f64], rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>, AssignError> {
+pub fn random_allowed(
+    cost: &[f64],
+    rows: usize,
+    cols: usize,
+    stream: &mut Stream,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Vec<u32>, AssignError> {
     if check_allowed(cost, rows, cols)?.forbidden == 0 {
         return random(rows, cols, stream);
     }
@@ -36,7 +43,7 @@ pub fn random_allowed(cost: &[f64], rows: usize, cols: usize, stream: &mut Strea
     let shuffled: Vec<f64> =
         row_order.iter().flat_map(|row| col_order.iter().map(move |col| entry(row, col))).collect();
     let mut matcher = Matcher::default();
-    matcher.run(&shuffled, rows, cols, 0.0);
+    matcher.run(&shuffled, rows, cols, 0.0, go_on)?;
     let mut col_of_row = vec![UNASSIGNED; rows];
     for (place, &row) in row_order.iter().enumerate() {
         if let Some(&col) = col_order.get(matcher.col_of_row[place] as usize) {

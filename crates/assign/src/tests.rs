@@ -84,10 +84,36 @@ fn a_solver_that_is_told_to_stop_stops_and_can_be_used_again() {
     let cost = distances(&agents, &goals, 2).unwrap();
     let mut solver = Solver::default();
     assert_eq!(solver.solve_allowed(&cost, 60, 60, &|| false), Err(AssignError::Interrupted));
+    let stopped = BottleneckSolver::default().solve_allowed(&cost, 60, 60, &|| false);
+    assert_eq!(stopped, Err(AssignError::Interrupted));
+    let large = vec![1.0; 300 * 300];
+    assert_eq!(greedy_allowed(&large, 300, 300, &|| false), Err(AssignError::Interrupted));
+    let mut banned = cost.clone();
+    banned[7] = f64::INFINITY;
+    let stopped = random::random_allowed(&banned, 60, 60, &mut stream(1), &|| false);
+    assert_eq!(stopped, Err(AssignError::Interrupted));
     assert_eq!(solver.solve_allowed(&cost, 60, 60, &|| true), exact(&cost, 60, 60));
     assert!(solver.solve_allowed(&[f64::NEG_INFINITY], 1, 1, &|| true).is_err());
     assert!(solver.solve_allowed(&[f64::NAN], 1, 1, &|| true).is_err());
     assert_eq!(solver.solve_allowed(&[f64::INFINITY; 2], 2, 1, &|| true).unwrap().col_of_row, [UNASSIGNED; 2]);
+}
+
+#[test]
+fn greedy_takes_the_cheapest_pair_also_where_it_sorts_in_pieces() {
+    let (rows, cols) = (300, 520);
+    let mut chance = stream(9);
+    // Whole numbers: many ties.
+    let cost: Vec<f64> = (0..rows * cols).map(|_| f64::from(chance.below(5000))).collect();
+    let mut order: Vec<usize> = (0..rows * cols).collect();
+    order.sort_by(|&a, &b| cost[a].total_cmp(&cost[b]).then(a.cmp(&b)));
+    let (mut expected, mut taken) = (vec![UNASSIGNED; rows], vec![false; cols]);
+    for place in order {
+        let (row, col) = (place / cols, place % cols);
+        if expected[row] == UNASSIGNED && !taken[col] {
+            (expected[row], taken[col]) = (col as u32, true);
+        }
+    }
+    assert_eq!(greedy(&cost, rows, cols).unwrap().col_of_row, expected);
 }
 
 fn small_problem() -> impl Strategy<Value = Problem> {
@@ -140,9 +166,9 @@ proptest! {
         prop_assert!(allowed(&answer.assignment) && answer.assignment.pairs().count() == pairs);
         prop_assert_eq!(answer.largest, largest);
         prop_assert!(close(answer.assignment.cost, within, &finite), "{} not {within}", answer.assignment.cost);
-        let answer = greedy_allowed(cost, rows, cols).unwrap();
+        let answer = greedy_allowed(cost, rows, cols, &|| true).unwrap();
         prop_assert!(allowed(&answer) && 2 * answer.pairs().count() >= pairs);
-        let col_of_row = random::random_allowed(cost, rows, cols, &mut chance).unwrap();
+        let col_of_row = random::random_allowed(cost, rows, cols, &mut chance, &|| true).unwrap();
         let answer = Assignment { cost: 0.0, col_of_row };
         prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
     }
@@ -233,6 +259,29 @@ fn ties_are_broken_the_same_way_every_time_and_nothing_is_remembered() {
 }
 
 #[test]
+fn shortlists_change_nothing_not_even_how_ties_are_broken() {
+    let (mut with, mut without) = (Solver::default(), Solver::default());
+    (with.lists_from, without.lists_from) = (Some(150), Some(usize::MAX));
+    for (index, (rows, cols)) in [(150, 150), (300, 300), (200, 400), (400, 180)].into_iter().enumerate() {
+        let mut stream = stream(index as u32);
+        let (agents, _) = uniform_points(rows, 1);
+        let (goals, _) = uniform_points(cols, 2);
+        let euclidean = distances(&agents, &goals, 2).unwrap();
+        let product = (0..rows * cols).map(|k| ((k / cols + 1) * (k % cols + 1)) as f64).collect();
+        let mut draw = |values: u32| (0..rows * cols).map(|_| f64::from(stream.below(values))).collect::<Vec<f64>>();
+        for (kind, cost) in [euclidean, product, draw(2), draw(40), draw(4000), draw(u32::MAX)].iter().enumerate() {
+            let expected = without.solve(cost, rows, cols).unwrap();
+            assert_eq!(with.solve(cost, rows, cols).unwrap(), expected, "{rows} x {cols}, kind {kind}");
+        }
+        let mut forbidden = draw(4000);
+        forbidden.iter_mut().step_by(3).for_each(|cost| *cost = f64::INFINITY);
+        let answers =
+            [&mut with, &mut without].map(|solver| solver.solve_allowed(&forbidden, rows, cols, &|| true).unwrap());
+        assert_eq!(answers[0], answers[1]);
+    }
+}
+
+#[test]
 fn equal_costs_are_solved_at_once_whatever_their_size() {
     for value in [0.0, -0.0, 0.1, -7.25, 1e300, -1e300, 1e-300] {
         for (rows, cols) in [(300, 300), (200, 300), (300, 200)] {
@@ -316,13 +365,13 @@ fn by_regret(cost: &[f32], n: usize, duals: &duals::Duals) -> Vec<u32> {
 
 #[test]
 fn duals_lead_close_to_the_optimum() {
-    for (n, instances, limit) in [(5, 100, 1.001), (20, 50, 1.003), (50, 40, 1.01)] {
+    for (n, instances, limit) in [(5, 100, 1.001), (20, 50, 1.003), (50, 40, 1.003), (150, 4, 1.01)] {
         let mut total = 0.0;
         for index in 0..instances {
             let (agents, goals) = uniform_points(n, index);
             let cost = distances(&agents, &goals, 2).unwrap();
             let narrow: Vec<f32> = cost.iter().map(|&c| c as f32).collect();
-            let duals = sinkhorn_duals(&narrow, n, n, &Schedule::default()).unwrap();
+            let duals = sinkhorn_duals(&narrow, n, n, &Schedule::for_pairs(n * n)).unwrap();
             total += cost_of(&cost, n, &by_regret(&narrow, n, &duals)) / exact(&cost, n, n).unwrap().cost;
         }
         let ratio = total / f64::from(instances);
@@ -358,7 +407,7 @@ fn the_bits_of_the_duals_are_pinned() {
     let cost: Vec<f32> = distances(&agents, &goals, 2).unwrap().iter().map(|&c| c as f32).collect();
     let duals = sinkhorn_duals(&cost, 37, 37, &Schedule::default()).unwrap();
     let mix = |hash: u32, value: &f32| hash.rotate_left(5).wrapping_mul(0x9e37_79b9) ^ value.to_bits();
-    assert_eq!(duals.rows.iter().chain(&duals.cols).fold(0, mix), 2_425_391_987);
+    assert_eq!(duals.rows.iter().chain(&duals.cols).fold(0, mix), 197_731_012);
 }
 
 #[test]
@@ -369,6 +418,7 @@ fn duals_refuse_bad_input_by_name() {
     assert!(refuse(&[1.0], &good).contains("1 numbers"));
     assert!(refuse(&[1.0, 2.0], &Schedule { last: 0.0, ..good }).contains("schedule.last"));
     assert!(refuse(&[1.0, 2.0], &Schedule { rounds: 0, ..good }).contains("schedule.rounds"));
+    assert!(refuse(&[1.0, 2.0], &Schedule { tolerance: f32::NAN, ..good }).contains("schedule.tolerance"));
 }
 
 const SUBSET: &str = include_str!("../testdata/dev-subset.json");

@@ -36,7 +36,7 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
             agent_id: name(&problem.agent_ids, agent),
             goal_id: name(&problem.goal_ids, goal as usize),
             distance,
-            probability: plan.probabilities.as_ref().and_then(|p| p.get(agent).copied()),
+            probability: plan.probabilities.as_ref().and_then(|p| p.get(agent).copied().flatten()),
             cost,
         });
     }

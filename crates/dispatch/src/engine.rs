@@ -2,6 +2,9 @@
 //!
 //! Stickiness: a pair that an agent has now is cheaper by the switching cost s. The exact answer on these costs minimises
 //! (summed cost) + s · (agents that leave the pair they have). Also with s = 0, pairs are not exchanged for equal ones.
+//! The learned scheduler knows nothing of what was before: of its answer only what is worth the switches is taken.
+
+mod sticky;
 
 use crate::problem::Problem;
 use crate::{DispatchError, UNASSIGNED};
@@ -17,16 +20,13 @@ pub const GAP_CELLS: usize = 1_000_000;
 /// Memory of larger problems is given back at once.
 const KEPT_CELLS: usize = 300_000;
 
-/// Part of the largest cost that an exchange must gain at least.
-const WORTH: f64 = 1e-9;
-
 /// An answer: a valid matching.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// `[N]` goal of each agent, or [`UNASSIGNED`].
     pub goal_of: Vec<u32>,
-    /// `[N]` probability of each choice (learned only).
-    pub probabilities: Option<Vec<f32>>,
+    /// `[N]` probability of each choice (learned only); none for a pair that was kept against it.
+    pub probabilities: Option<Vec<Option<f32>>>,
     /// What answered.
     pub scheduler: SchedulerKind,
     /// Summed cost.
@@ -96,7 +96,12 @@ pub fn not_for_learned(problem: &Problem) -> Option<&'static str> {
     if problem.matrix.is_some() || !problem.overrides.is_empty() {
         return Some("the learned scheduler knows positions, not costs");
     }
-    (problem.cells() > GAP_CELLS).then_some("more pairs than the learned scheduler's 1,000,000")
+    (learned_cells(problem) > GAP_CELLS).then_some("more than the learned scheduler's 1,000 agents or goals")
+}
+
+/// Pairs that the learned scheduler looks at: it fills the smaller side up.
+pub fn learned_cells(problem: &Problem) -> usize {
+    problem.agent_count.max(problem.goal_count).pow(2)
 }
 
 impl Workspace {
@@ -132,10 +137,10 @@ impl Workspace {
             SchedulerKind::Makespan => {
                 makespan.solve_allowed(target, rows, cols, go_on).map_err(refused)?.assignment.col_of_row
             }
-            SchedulerKind::Greedy => greedy_allowed(target, rows, cols).map_err(refused)?.col_of_row,
+            SchedulerKind::Greedy => greedy_allowed(target, rows, cols, go_on).map_err(refused)?.col_of_row,
             SchedulerKind::Random => {
                 let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                random_allowed(costs, rows, cols, &mut stream).map_err(refused)?
+                random_allowed(costs, rows, cols, &mut stream, go_on).map_err(refused)?
             }
         };
         let kind = if kind == SchedulerKind::Learned { SchedulerKind::Exact } else { kind };
@@ -151,21 +156,18 @@ impl Workspace {
     ) -> Result<Plan, String> {
         let cols = problem.goal_count;
         problem.costs_into(&mut self.costs).map_err(|error| error.to_string())?;
-        let mut goal_of: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
-        let mut probabilities = probabilities;
-        let forbidden = pairs(&goal_of).find(|&(agent, goal)| self.costs[agent * cols + goal] == f64::INFINITY);
+        let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
+        let forbidden = pairs(&wish).find(|&(agent, goal)| self.costs[agent * cols + goal] == f64::INFINITY);
         if let Some((agent, goal)) = forbidden {
             return Err(format!("the model chose the forbidden pair of agent {agent} and goal {goal}"));
         }
+        let mut goal_of = wish.clone();
         if self.adjust(problem) {
-            // The model knows nothing of what was before: its answer must be worth the switches.
-            let kept = problem.current.clone();
-            let possible = pairs(&kept).all(|(agent, goal)| self.costs[agent * cols + goal] < f64::INFINITY);
-            let full = possible && pairs(&kept).count() == pairs(&goal_of).count();
-            if full && cost_of(&self.adjusted, cols, &kept) <= cost_of(&self.adjusted, cols, &goal_of) {
-                (goal_of, probabilities) = (kept, None);
-            }
+            goal_of = sticky::follow(&wish, &self.adjusted, cols, &problem.current, &mut self.solver, go_on)
+                .map_err(|error| refused(error).to_string())?;
         }
+        let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
+        let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
         self.finish(problem, goal_of, probabilities, SchedulerKind::Learned, None, go_on)
             .map_err(|error| error.to_string())
     }
@@ -177,13 +179,9 @@ impl Workspace {
         if problem.current.iter().all(|&goal| goal == UNASSIGNED) {
             return false;
         }
-        let largest = costs.iter().filter(|cost| cost.is_finite()).fold(0.0f64, |top, cost| top.max(cost.abs()));
-        let bonus = problem.switching_cost.max(WORTH * largest);
         adjusted.clear();
         adjusted.extend_from_slice(costs);
-        for (agent, goal) in pairs(&problem.current) {
-            adjusted[agent * cols + goal] -= bonus;
-        }
+        sticky::favour(adjusted, cols, &problem.current, problem.switching_cost);
         true
     }
 
@@ -191,7 +189,7 @@ impl Workspace {
         &mut self,
         problem: &Problem,
         goal_of: Vec<u32>,
-        probabilities: Option<Vec<f32>>,
+        probabilities: Option<Vec<Option<f32>>>,
         scheduler: SchedulerKind,
         exact_cost: Option<f64>,
         go_on: &dyn Fn() -> bool,

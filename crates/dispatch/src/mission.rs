@@ -12,11 +12,13 @@ use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::SchedulerKind;
 use magex_proto::v1;
-use members::{Known, check_id, check_lengths, lifetime, merge, most_pairs, sticky_scheduler};
+use members::{Known, check_id, check_lengths, check_record, lifetime, merge, most_pairs, sticky_scheduler};
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 /// Longest text for people, bytes.
 const LONGEST_TITLE: usize = 256;
+/// Bytes of a pair besides its names.
+const PAIR: usize = 24;
 /// Names of missions that are training episodes begin with this.
 pub const TRAINING_PREFIX: &str = "training.";
 
@@ -70,6 +72,18 @@ struct Record {
 }
 
 impl Mission {
+    /// Bytes that it takes, as on the wire.
+    pub fn bytes(&self) -> usize {
+        let pairs = self.forbidden.iter().chain(self.overrides.keys());
+        magex_proto::encoded_len(&self.assignment)
+            + pairs.map(|(agent, goal)| agent.len() + goal.len() + PAIR).sum::<usize>()
+    }
+
+    /// Agents and goals.
+    pub fn size(&self) -> (usize, usize) {
+        (self.assignment.agents.len(), self.assignment.goals.len())
+    }
+
     /// A new mission, planned. `drawn_id` is its name if the request brings none; `now` is milliseconds since 1970.
     ///
     /// # Errors
@@ -200,14 +214,16 @@ impl Mission {
     /// What was kept on disk.
     ///
     /// # Errors
-    /// Bytes that are not such a record.
+    /// Bytes that are not such a record, or that no mission can have written.
     pub fn decode(bytes: &[u8]) -> Result<Self, ConvertError> {
         let record: Record =
             prost::Message::decode(bytes).map_err(|error| ConvertError::new("mission", error.to_string()))?;
         let names = |pair: v1::PairRef| (pair.agent_id, pair.goal_id);
+        let assignment = record.assignment.ok_or_else(|| ConvertError::missing("mission"))?;
+        check_record(&assignment, &record.overrides)?;
         let overrides = record.overrides.into_iter();
         Ok(Self {
-            assignment: record.assignment.ok_or_else(|| ConvertError::missing("mission"))?,
+            assignment,
             forbidden: record.forbidden.into_iter().map(names).collect(),
             overrides: overrides.filter_map(|item| Some((names(item.pair?), item.cost))).collect(),
             lifetime_ms: record.lifetime_ms,

@@ -34,6 +34,8 @@ pub struct Episode<'a> {
     pub exact_cost: f64,
     /// When it was answered, milliseconds since 1970.
     pub at_ms: i64,
+    /// When it is shown no more, milliseconds since 1970.
+    pub expires_ms: i64,
 }
 
 impl Episode<'_> {
@@ -100,6 +102,7 @@ impl Episode<'_> {
             run_id: self.run_id.to_owned(),
             created_ms: self.at_ms,
             updated_ms: self.at_ms,
+            expires_ms: self.expires_ms,
             ..Default::default()
         }
     }

@@ -181,7 +181,7 @@ fn wrong_fields_are_named() {
 
 #[test]
 fn missions_are_bounded_in_number_and_age() {
-    let bounds = Bounds { total: 3, per_owner: 2, each: LIMITS };
+    let bounds = Bounds { total: 3, per_owner: 2, each: LIMITS, ..Bounds::default() };
     let missions = Missions::open(None, bounds).unwrap();
     let make = |id: &str, owner: &str, now: i64| {
         let request = v1::CreateMissionRequest { mission_id: id.into(), ..request(0.0) };
@@ -200,8 +200,46 @@ fn missions_are_bounded_in_number_and_age() {
     let next = change(&first, v1::UpdateMissionRequest::default());
     assert_eq!(missions.replace(next.clone(), 1).unwrap().assignment.revision, 2);
     assert!(matches!(missions.replace(next, 1), Err(KeepError::Changed { found: 2, .. })));
-    missions.remove("2").unwrap();
-    assert!(matches!(missions.remove("2"), Err(KeepError::Missing(_))));
+    missions.remove("2", |_| true).unwrap();
+    assert!(matches!(missions.remove("2", |_| true), Err(KeepError::Missing(_))));
+}
+
+#[test]
+fn a_mission_that_is_no_longer_the_one_that_was_looked_at_stays() {
+    let missions = Missions::open(None, Bounds::default()).unwrap();
+    let make = |owner: &str| Mission::create(request(0.0), owner, "", 1000, &LIMITS, &planner).unwrap();
+    let mine = missions.insert(make("me")).unwrap();
+    // Between my look and my change somebody else takes the name, at the same revision, in the same millisecond.
+    let next = change(&mine, v1::UpdateMissionRequest::default());
+    missions.remove("m", |_| true).unwrap();
+    let theirs = missions.insert(make("them")).unwrap();
+    let mine = |mission: &Mission| mission.assignment.owner == "me";
+    let absent = missions.remove("nobody's", mine).unwrap_err().to_string().replace("nobody's", "m");
+    assert_eq!(missions.remove("m", mine).unwrap_err().to_string(), absent);
+    assert_eq!(missions.replace(next, 1).unwrap_err().to_string(), absent);
+    assert_eq!(missions.get("m").unwrap(), theirs);
+    missions.remove("m", |mission| mission.assignment.owner == "them").unwrap();
+}
+
+#[test]
+fn missions_are_bounded_in_bytes() {
+    let make = |id: &str| {
+        let request = v1::CreateMissionRequest { mission_id: id.into(), ..request(0.0) };
+        Mission::create(request, "me", "", 0, &LIMITS, &planner).unwrap()
+    };
+    let bytes = 2 * make("1").bytes();
+    let missions = Missions::open(None, Bounds { bytes, ..Bounds::default() }).unwrap();
+    missions.insert(make("1")).unwrap();
+    let second = missions.insert(make("2")).unwrap();
+    assert!(matches!(missions.insert(make("3")), Err(KeepError::Full(text)) if text.contains("bytes")));
+    let agents = (0..15).map(|k| member(&format!("another-{k}"), &[1.0, 2.0])).collect();
+    let more = v1::UpdateMissionRequest { agents, ..Default::default() };
+    assert!(matches!(missions.replace(change(&second, more), 1), Err(KeepError::Full(_))));
+    let less = change(&second, v1::UpdateMissionRequest { remove_agents: vec!["b".into()], ..Default::default() });
+    assert!(less.bytes() < second.bytes());
+    missions.replace(less, 1).unwrap();
+    missions.remove("1", |_| true).unwrap();
+    missions.insert(make("3")).unwrap();
 }
 
 #[test]
@@ -217,7 +255,7 @@ fn missions_survive_on_disk_and_the_file_has_one_owner() {
         missions.insert(Mission::create(full, "me", "", 5, &LIMITS, &planner).unwrap()).unwrap();
         let gone = v1::CreateMissionRequest { mission_id: "gone".into(), ..request(0.0) };
         missions.insert(Mission::create(gone, "me", "", 5, &LIMITS, &planner).unwrap()).unwrap();
-        missions.remove("gone").unwrap();
+        missions.remove("gone", |_| true).unwrap();
         missions.get("m").unwrap()
     };
     assert_eq!(goals(&kept), [("a", "y"), ("b", "x")]);

@@ -1,6 +1,6 @@
 //! The command line: what can be asked for, and how the process ends.
 
-use crate::commands::{assign, bench, eval, replay, roles, train, verify};
+use crate::commands::{assign, bench, eval, health, replay, roles, train, train_commander, verify};
 use crate::failure;
 use crate::logging;
 use crate::output::{Output, note};
@@ -61,11 +61,13 @@ impl Global {
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    TrainCommander(train_commander::TrainCommanderArgs),
     Eval(eval::EvalArgs),
     Replay(replay::ReplayArgs),
     Assign(assign::AssignArgs),
     Bench(bench::BenchArgs),
     Verify(verify::VerifyArgs),
+    Health(health::HealthArgs),
     Learner(Box<roles::LearnerRole>),
     Actor(roles::ActorRole),
     Commander(roles::CommanderRole),
@@ -73,7 +75,7 @@ enum Command {
 
 /// Parses the arguments, does what they ask for, and says how it went.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::try_parse_from(roles::by_name(std::env::args_os())) {
         Ok(cli) => cli,
         Err(error) => {
             // Nobody left to tell if this fails.
@@ -88,11 +90,13 @@ pub fn main() -> ExitCode {
     }
     let result = match &cli.command {
         Command::Train(args) => train::run(args, &global),
+        Command::TrainCommander(args) => train_commander::run(args, &global),
         Command::Eval(args) => eval::run(args, &global),
         Command::Replay(args) => replay::run(args, &global),
         Command::Assign(args) => assign::run(args, &global),
         Command::Bench(args) => bench::run(args, &global),
         Command::Verify(args) => verify::run(args, &global),
+        Command::Health(args) => health::run(args, &global),
         Command::Learner(role) => roles::learner(role),
         Command::Actor(role) => roles::actor(role),
         Command::Commander(role) => roles::commander(role),

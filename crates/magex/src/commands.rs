@@ -3,7 +3,9 @@
 pub(crate) mod assign;
 pub(crate) mod bench;
 pub(crate) mod eval;
+pub(crate) mod health;
 pub(crate) mod replay;
 pub(crate) mod roles;
 pub(crate) mod train;
+pub(crate) mod train_commander;
 pub(crate) mod verify;

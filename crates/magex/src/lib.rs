@@ -17,3 +17,4 @@ mod output;
 mod progress;
 mod settings;
 mod supervise;
+mod synthetic;

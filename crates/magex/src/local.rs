@@ -37,7 +37,7 @@ impl Crew {
     /// Rolls out one shard.
     pub fn work(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
         self.roller
-            .rollout(shard, |request| answer(&self.commander, self.random_share, request))
+            .rollout(shard, |request| answer(&self.commander, self.random_share, request, &|| true))
             .map_err(|e| CollectError::Shard { shard: *shard, reason: e.to_string() })
     }
 

@@ -56,6 +56,7 @@ pub(crate) struct Progress {
     crashes: bool,
     colours: bool,
     last_iteration: Option<Instant>,
+    page: Option<String>,
 }
 
 impl Progress {
@@ -77,7 +78,7 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, crashes, colours: false, last_iteration: None };
+            return Self { bar: None, rows: 0, target, crashes, colours: false, last_iteration: None, page: None };
         }
         let colours = colours();
         let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
@@ -91,7 +92,7 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, crashes, colours, last_iteration: None }
+        Self { bar: Some(bar), rows: 0, target, crashes, colours, last_iteration: None, page: None }
     }
 
     /// Something happened.
@@ -113,6 +114,21 @@ impl Progress {
     /// When the last iteration was reported: the one that reached the target, if it was reached.
     pub(crate) fn last_iteration(&self) -> Option<Instant> {
         self.last_iteration
+    }
+
+    /// Says where the live page is.
+    pub(crate) fn page(&mut self, address: &str) {
+        let url = format!("http://{address}/");
+        match &self.bar {
+            Some(_) => note(format!("live page: {url}\n")),
+            None => tracing::info!(url, "live page"),
+        }
+        self.page = Some(url);
+    }
+
+    /// Where the live page is, or was.
+    pub(crate) fn page_url(&self) -> Option<&str> {
+        self.page.as_deref()
     }
 
     /// Text of the status line.

@@ -3,7 +3,7 @@
 //! Whatever crashes is started again: the learner continues from its checkpoint on the same port, the others find it
 //! again by themselves, and the result is the same. The services hold a pipe to this process and stop when it is gone.
 
-mod service;
+pub(crate) mod service;
 
 use crate::commands::train::{End, Job, trainer};
 use crate::failure::coded;
@@ -53,11 +53,16 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
     let logs = job.folder.join("logs");
     let service = |name: &str, arguments: &[&str]| Service::new(name, arguments, &logs);
     let (out, threads) = (job.folder.display().to_string(), job.threads.to_string());
-    let learner = |listen: &str| {
-        service("learner", &["learner", "--resume", "--out", &out, "--threads", &threads, "--listen", listen])
+    let learner = |listen: &str, http: Option<&str>| {
+        let own: [&str; 8] = ["learner", "--resume", "--out", &out, "--threads", &threads, "--listen", listen];
+        let page = http.map(|http| ["--http", http]);
+        service("learner", &own.into_iter().chain(page.into_iter().flatten()).collect::<Vec<_>>())
     };
-    let mut running = learner("127.0.0.1:0")?.start().await?;
-    let address = running.address.clone();
+    let mut running = learner("127.0.0.1:0", job.http.as_deref())?.start().await?;
+    let (address, http) = (running.address.clone(), running.http.clone());
+    if let Some(http) = &http {
+        progress.page(http);
+    }
     let url = format!("http://{address}");
     let commander = service("commander", &["commander", "--learner", &url, "--listen", "127.0.0.1:0"])?.start().await?;
     let commander_url = format!("http://{}", commander.address);
@@ -101,7 +106,7 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
                     tokio::time::sleep(Duration::from_millis(200)).await;
                     // A start that fails (killed again, the port still taken) costs a life like any other death.
                     running = loop {
-                        match learner(&address)?.start().await {
+                        match learner(&address, http.as_deref())?.start().await {
                             Ok(running) => break running,
                             Err(error) if lives <= 1 => return Err(error),
                             Err(error) => {
@@ -188,7 +193,8 @@ async fn watch(url: String, events: mpsc::Sender<RunEvent>) {
 
 async fn follow(url: &str, events: &mpsc::Sender<RunEvent>) -> anyhow::Result<()> {
     let mut client = LearnerServiceClient::new(client::endpoint(url)?.connect().await?);
-    let mut stream = client.watch_run(v1::WatchRunRequest {}).await?.into_inner();
+    let opened = tokio::time::timeout(Duration::from_secs(10), client.watch_run(v1::WatchRunRequest {})).await;
+    let mut stream = opened??.into_inner();
     while let Some(message) = stream.message().await? {
         let event = match message.event {
             Some(Event::Iteration(e)) => RunEvent::Iteration(IterationReport {

@@ -113,14 +113,18 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
         "curve.svg",
         "replay.html",
         "checkpoints",
+        "tensorboard/events.out.tfevents.0001",
     ] {
         assert!(place.path(out).join(file).exists(), "{file}");
     }
     assert_eq!(fs::read_to_string(place.path(out).join("metrics.jsonl")).unwrap().lines().count(), 4);
 
+    assert!(summary["page"].as_str().unwrap().starts_with("http://127.0.0.1:"), "{summary}");
+
     // The name is taken: the next run of the same kind gets another, with the same weights.
-    let again = place.json("train tiny.toml --in-process --seed 3 --threads 1");
+    let again = place.json("train tiny.toml --in-process --seed 3 --threads 1 --http off");
     assert_eq!(again["out"], format!("{out}-2"));
+    assert!(again["page"].is_null());
     assert_eq!(again["weights_sha256"], summary["weights_sha256"]);
 
     let eval = place.json(&format!("eval {out} --episodes 20 --seeds 1,2 --threads 1"));
@@ -153,6 +157,7 @@ fn services_give_the_weights_of_one_process() {
     let services = place.json("train tiny.toml --out services --actors 2");
     assert_eq!(alone["weights_sha256"], services["weights_sha256"]);
     assert_eq!(services["in_process"], false);
+    assert!(services["page"].as_str().unwrap().starts_with("http://127.0.0.1:"), "{services}");
     for log in ["learner", "commander", "actor-0", "actor-1"] {
         assert!(place.path("services/logs").join(format!("{log}.log")).exists(), "{log}");
     }
@@ -203,7 +208,7 @@ fn a_corrupt_checkpoint_is_named_and_the_one_before_it_is_used() {
     for name in ["000001", "000002", "000003"] {
         fs::remove_file(checkpoints.join(name).join("manifest.json")).unwrap();
     }
-    place.fails("train --resume --out run", 1, &["no usable checkpoint"]);
+    place.fails("train --resume --out run", 1, &["none of 3 checkpoints can be used"]);
 }
 
 #[test]
@@ -214,6 +219,7 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
     place.trained("run");
     fs::create_dir(place.path("full")).unwrap();
     fs::write(place.path("full/notes.txt"), "").unwrap();
+    fs::write(place.path("token"), "secret").unwrap();
     for (line, code, words) in [
         ("", 64, &["Usage"] as &[&str]),
         ("train --frobnicate", 64, &["--frobnicate"]),
@@ -225,6 +231,7 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("train --executor best", 64, &["best", "local"]),
         ("train --actors 0", 64, &["1 to 256"]),
         ("train --max-steps 0", 64, &["run.max_steps"]),
+        ("train --http here", 64, &["--http here", "HOST:PORT", "off"]),
         ("train tiny.toml --out run", 73, &["run exists", "--resume"]),
         ("train tiny.toml --out full", 73, &["full exists", "another folder"]),
         ("train --resume", 64, &["--out"]),
@@ -244,6 +251,15 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("assign --agents [[0,0]] --goals [[0]]", 64, &["goals"]),
         ("assign --agents [[0,0]] --goals [[0,1]] --connect localhost:1", 64, &["http://host:port"]),
         ("assign --agents [[0,0]] --goals [[0,1]] --connect http://127.0.0.1:1", 69, &["127.0.0.1:1"]),
+        ("assign --random 2 --token-file token --connect http://10.1.2.3:1", 64, &["unencrypted", "--insecure"]),
+        ("assign --random 2 --token-file none", 64, &["none", "No such file"]),
+        ("assign --random 2 --connect https://127.0.0.1:1", 64, &["--tls-ca"]),
+        ("actor --token-file token --learner http://10.1.2.3:1", 64, &["unencrypted", "--insecure"]),
+        ("commander --token-file token --learner http://10.1.2.3:1", 64, &["unencrypted", "--insecure"]),
+        ("learner --listen 0.0.0.0:0", 64, &["--tls-cert and --tls-key, and --identities", "--insecure"]),
+        ("learner --tls-cert token", 64, &["--tls-key"]),
+        ("learner --tls-cert token --tls-key token", 64, &["--tls-cert"]),
+        ("learner --identities token", 64, &["token"]),
     ] {
         place.fails(line, code, words);
     }
@@ -309,4 +325,17 @@ fn a_commander_answers_the_command_line() {
     assert_eq!((&answer["scheduler"], &answer["weights_sha256"]), (&"learned".into(), &run["weights_sha256"]));
     assert!(answer["pairs"][3]["probability"].is_number());
     place.fails("commander --model nowhere", 64, &["nowhere"]);
+}
+
+#[test]
+fn the_cluster_bench_measures_every_row() {
+    let place = Place::new();
+    let line = "bench cluster --agents 5 --episodes 1 --seconds 1 --actors 6 --versions 3 --kills 1";
+    let value = place.json(line);
+    let rows = value["cluster"]["rows"].as_array().unwrap();
+    assert_eq!(rows.len(), 6, "{value}");
+    assert!(rows[0]["agent_steps_per_s"].as_f64().unwrap() > 0.0, "{value}");
+    assert!(rows[1]["calls"].as_u64().unwrap() > 0, "{value}");
+    assert!(rows[4]["p95_ms"].as_f64().unwrap() > 0.0 && rows[4]["skipped"].as_u64().unwrap() < 3 * 63, "{value}");
+    assert!(rows[5]["worst_s"].as_f64().unwrap() > 0.0, "{value}");
 }

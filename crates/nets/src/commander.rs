@@ -2,18 +2,18 @@
 //!
 //! | kind | decision |
 //! |---|---|
-//! | `pairwise` | a score for every (agent, goal) pair; agents pick in turn among the goals still free. Equivariant, any N |
+//! | `pairwise` | a score for every (agent, goal) pair; whoever has most to lose picks next among the goals still free. Equivariant, any N |
 //! | `ranking` | the paper's Goal Scheduler: one score per goal, ranked, handed to the agents in canonical order |
 //! | `exact` | the least summed distance (Jonker–Volgenant; the paper's "Hungarian") |
 //! | `random` | a random permutation (the paper's ablation "w. RG") |
 
+mod instance;
 mod pairwise;
 mod ranking;
 
-use crate::ops::{Pick, PickTable, masked_log_softmax, pick_log_probs};
+use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{ParamError, Params, Source, from_safetensors};
 use candle_core::{Device, Tensor};
-use magex_assign::duals::{Schedule, sinkhorn_duals};
 use magex_assign::random::random;
 use magex_assign::{AssignError, exact_points};
 use magex_core::config::{CommanderConfig, CommanderKind};
@@ -21,6 +21,7 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use std::sync::Arc;
 
+pub use instance::Instance;
 pub use pairwise::PairwiseNet;
 pub use ranking::RankingNet;
 
@@ -36,6 +37,9 @@ pub enum CommanderError {
     /// The weights do not fit, or the tensor library refused.
     #[error(transparent)]
     Weights(#[from] ParamError),
+    /// Nobody waits for the answer any more.
+    #[error("interrupted")]
+    Interrupted,
 }
 
 impl From<candle_core::Error> for CommanderError {
@@ -74,24 +78,6 @@ pub struct Decision {
     pub log_prob: f32,
     /// `[N]` probability of each agent's pick when it was made; 1 for schedulers that are not learned.
     pub probabilities: Vec<f32>,
-}
-
-/// What a learned scheduler sees of a team, computed once.
-#[derive(Debug, Clone)]
-pub struct Instance {
-    /// Network input.
-    features: Vec<f32>,
-    /// Rows of the score matrix (1 for `ranking`).
-    rows: usize,
-    /// Columns of the score matrix.
-    columns: usize,
-    /// For each pick in turn: the row that picks and whom it stands for.
-    turns: Vec<(u32, u32)>,
-    /// Column → goal (or agent, when goals pick agents because there are fewer of them).
-    column_of: Vec<u32>,
-    /// Goals pick agents.
-    swapped: bool,
-    agents: usize,
 }
 
 /// A network that scores instances.
@@ -184,12 +170,9 @@ impl Commander {
 
     /// Flat scores of several instances, one score matrix after the other.
     pub fn scores(&self, instances: &[Instance]) -> Result<Tensor, CommanderError> {
-        let count: usize = instances.iter().map(|i| i.features.len()).sum();
-        let mut features = Vec::with_capacity(count);
-        instances.iter().for_each(|i| features.extend_from_slice(&i.features));
         match &self.net {
-            Some(Net::Pairwise(net)) => Ok(net.forward(features)?),
-            Some(Net::Ranking(net)) => Ok(net.forward(features)?),
+            Some(Net::Pairwise(net)) => Ok(net.forward(instances)?),
+            Some(Net::Ranking(net)) => Ok(net.forward(instances)?),
             None => Err(CommanderError::Instance(format!("the {} scheduler has no network", self.kind))),
         }
     }
@@ -206,71 +189,8 @@ impl Commander {
     }
 }
 
-impl Instance {
-    /// Picks in turn: the best free column, or a sample. Returns the decision and its picks.
-    pub fn decide(&self, scores: &[f32], mut stream: Option<&mut Stream>) -> (Decision, Vec<Pick>) {
-        let mut free = vec![true; self.columns];
-        let mut log_probs = vec![0.0f32; self.columns];
-        let mut decision =
-            Decision { goals: vec![u32::MAX; self.agents], log_prob: 0.0, probabilities: vec![0.0; self.agents] };
-        let mut picks = Vec::with_capacity(self.turns.len());
-        for &(row, who) in &self.turns {
-            let scores = &scores[row as usize * self.columns..(row as usize + 1) * self.columns];
-            masked_log_softmax(scores, &free, &mut log_probs);
-            let open = || log_probs.iter().zip(&free).enumerate().filter(|(_, (_, f))| **f).map(|(j, (x, _))| (j, *x));
-            let best = open().fold((0, f32::NEG_INFINITY), |best, next| if next.1 > best.1 { next } else { best }).0;
-            let column = match &mut stream {
-                None => best,
-                Some(stream) => {
-                    let u = stream.uniform32();
-                    let mut sum = 0.0;
-                    open()
-                        .find(|(_, x)| {
-                            sum += libm::expf(*x);
-                            u < sum
-                        })
-                        .map_or(best, |(j, _)| j)
-                }
-            };
-            free[column] = false;
-            decision.log_prob += log_probs[column];
-            let target = self.column_of[column];
-            let (agent, goal) = if self.swapped { (target, who) } else { (who, target) };
-            decision.goals[agent as usize] = goal;
-            decision.probabilities[agent as usize] = libm::expf(log_probs[column]);
-            picks.push(Pick { row, column: column as u32 });
-        }
-        (decision, picks)
-    }
-
-    /// The picks that lead to a given decision (`[N]` goals), in the order of the turns; `None` if it is not one-to-one.
-    pub fn picks_of(&self, goals: &[u32]) -> Option<Vec<Pick>> {
-        let mut agent_of = std::collections::BTreeMap::new();
-        for (agent, goal) in goals.iter().enumerate() {
-            agent_of.insert(*goal, agent as u32);
-        }
-        let mut free = vec![true; self.columns];
-        let mut picks = Vec::with_capacity(self.turns.len());
-        for &(row, who) in &self.turns {
-            let target = if self.swapped { *agent_of.get(&who)? } else { *goals.get(who as usize)? };
-            let column = self.column_of.iter().position(|&c| c == target)?;
-            if !std::mem::replace(&mut free[column], false) {
-                return None;
-            }
-            picks.push(Pick { row, column: column as u32 });
-        }
-        Some(picks)
-    }
-}
-
 /// A constant tensor [rows, width].
 fn constant(numbers: Vec<f32>, width: usize) -> candle_core::Result<Tensor> {
     let rows = numbers.len() / width;
     Tensor::from_vec(numbers, (rows, width), &Device::Cpu)
-}
-
-/// Entropic transport prices of a distance matrix [rows, columns].
-fn duals(cost: &[f32], rows: usize, columns: usize) -> Result<(Vec<f32>, Vec<f32>), CommanderError> {
-    let duals = sinkhorn_duals(cost, rows, columns, &Schedule::default())?;
-    Ok((duals.rows, duals.cols))
 }

@@ -13,7 +13,7 @@ pub use graph::{GraphBlock, GraphNoise, graph_block};
 pub use gru::gru;
 pub use linear::linear;
 pub use norm::layer_norm;
-pub(crate) use picks::masked_log_softmax;
+pub(crate) use picks::{MaskedSoftmax, Open};
 pub use picks::{Pick, PickTable, pick_log_probs};
 pub use pool::{mean_of_others, neighbour_pool};
 

@@ -1,37 +1,193 @@
-//! Connecting to a service.
+//! Connecting to a service, and showing it who we are.
 
 use crate::tls::ClientTls;
+use std::path::Path;
 use std::time::Duration;
-use tonic::transport::{Channel, Endpoint};
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{self, Endpoint};
+use tonic::{Request, Status};
 
-/// A url that cannot be connected to, whatever runs there.
+/// A connection whose calls carry the caller's token, if it has one.
+pub type Channel = InterceptedService<transport::Channel, Bearer>;
+
+/// A url that is not connected to, whatever runs there.
 #[derive(Debug, thiserror::Error)]
-#[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
-pub struct UrlError {
-    url: String,
-    reason: String,
+pub enum UrlError {
+    /// It makes no sense.
+    #[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
+    Form {
+        /// The url.
+        url: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Whoever listens on the way would learn the token.
+    #[error(
+        "'{0}': the token would travel unencrypted to another machine; use https, or --insecure to send it all the same"
+    )]
+    Exposed(String),
 }
 
-/// An endpoint with our settings. For an https url the certificates are those that the environment names
-/// ([`ClientTls::from_env`]).
+/// Why there is no connection.
+#[derive(Debug, thiserror::Error)]
+pub enum ConnectError {
+    /// There cannot be one.
+    #[error(transparent)]
+    Url(#[from] UrlError),
+    /// Nobody answers there.
+    #[error(transparent)]
+    Transport(#[from] transport::Error),
+}
+
+/// A bearer token. Debug output does not show it.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Token(MetadataValue<Ascii>);
+
+/// A token that cannot be used. Does not contain it.
+#[derive(Debug, thiserror::Error)]
+pub enum TokenError {
+    /// Its file.
+    #[error("the token's file {path}: {source}")]
+    File {
+        /// Its name.
+        path: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// What is in there.
+    #[error("{0}: a token is one line of printable ASCII")]
+    Form(String),
+}
+
+impl Token {
+    /// A token from where `source` says; space around it does not count.
+    ///
+    /// # Errors
+    /// It cannot be sent.
+    pub fn new(text: &str, source: &str) -> Result<Self, TokenError> {
+        let (text, wrong) = (text.trim(), || TokenError::Form(source.to_owned()));
+        if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
+            return Err(wrong());
+        }
+        let mut value: MetadataValue<Ascii> = format!("Bearer {text}").parse().map_err(|_| wrong())?;
+        value.set_sensitive(true);
+        Ok(Self(value))
+    }
+
+    /// The token in a file.
+    ///
+    /// # Errors
+    /// The file cannot be read, or there is no token in it.
+    pub fn read(path: &Path) -> Result<Self, TokenError> {
+        let name = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|source| TokenError::File { path: name.clone(), source })?;
+        Self::new(&text, &name)
+    }
+}
+
+// A token must not reach a log.
+impl std::fmt::Debug for Token {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Token")
+    }
+}
+
+/// How a program shows who it is, and whom it trusts. Read once: it serves every connection.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// For https.
+    pub tls: Option<ClientTls>,
+    /// Sent with every call.
+    pub token: Option<Token>,
+    /// The token may travel unencrypted.
+    pub insecure: bool,
+}
+
+impl Settings {
+    /// A channel that connects with the first call and again whenever it is broken.
+    ///
+    /// # Errors
+    /// The url makes no sense, or the token would be seen.
+    pub fn lazy_channel(&self, url: &str) -> Result<Channel, UrlError> {
+        let (endpoint, bearer) = self.endpoint(url)?;
+        Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
+    }
+
+    /// A channel that is connected.
+    ///
+    /// # Errors
+    /// The url makes no sense, the token would be seen, or nobody answers.
+    pub async fn connect(&self, url: &str) -> Result<Channel, ConnectError> {
+        let (endpoint, bearer) = self.endpoint(url)?;
+        Ok(InterceptedService::new(endpoint.connect().await?, bearer))
+    }
+
+    fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), UrlError> {
+        let endpoint = endpoint_with(url, self.tls.as_ref())?;
+        let encrypted = endpoint.uri().scheme_str() == Some("https");
+        if self.token.is_some() && !encrypted && !self.insecure && !is_local(endpoint.uri().host()) {
+            return Err(UrlError::Exposed(url.to_owned()));
+        }
+        Ok((endpoint, Bearer(self.token.clone())))
+    }
+}
+
+/// A host that is this machine. A name is believed only if it can be no other's.
+fn is_local(host: Option<&str>) -> bool {
+    let host = host.unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
+    host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|address| address.is_loopback())
+}
+
+/// Adds the token to every call.
+#[derive(Debug, Clone)]
+pub struct Bearer(Option<Token>);
+
+impl Interceptor for Bearer {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(Token(value)) = &self.0 {
+            request.metadata_mut().insert("authorization", value.clone());
+        }
+        Ok(request)
+    }
+}
+
+/// An endpoint with our settings, without certificates.
+///
+/// # Errors
+/// The url makes no sense.
 pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
+    endpoint_with(url, None)
+}
+
+/// An endpoint whose certificates, for an https url, are those that the environment names.
+///
+/// # Errors
+/// The url makes no sense, or the certificates cannot be read.
+pub fn endpoint_from_env(url: &str) -> Result<Endpoint, UrlError> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
     let tls = secure.then(ClientTls::from_env).transpose();
-    let tls = tls.map_err(|error| UrlError { url: url.to_owned(), reason: error.to_string() })?;
+    let tls = tls.map_err(|error| UrlError::Form { url: url.to_owned(), reason: error.to_string() })?;
     endpoint_with(url, tls.as_ref())
 }
 
-/// An endpoint with our settings: a peer that is gone is noticed within 15 s even when nothing is being said.
+/// An endpoint with our settings: a peer that is gone is noticed within 15 s even when nothing is being said. The
+/// certificates count for https only.
+///
+/// # Errors
+/// The url makes no sense.
 pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
-    let wrong = |reason: String| UrlError { url: url.to_owned(), reason };
+    let wrong = |reason: String| UrlError::Form { url: url.to_owned(), reason };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;
     let endpoint = match (endpoint.uri().scheme_str(), tls) {
-        (Some("http"), None) if endpoint.uri().host().is_some() => endpoint,
-        (Some("https"), Some(tls)) if endpoint.uri().host().is_some() => {
-            endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?
+        _ if endpoint.uri().host().is_none() => return Err(wrong("no host".to_owned())),
+        (Some("http"), _) => endpoint,
+        (Some("https"), Some(tls)) => endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?,
+        (Some("https"), None) => {
+            let problem = "name the authority that signed its certificate: MAGEX_TLS_CA or --tls-ca";
+            return Err(wrong(problem.to_owned()));
         }
-        (Some("http"), Some(_)) => return Err(wrong("certificates need an https url".to_owned())),
-        (Some("https"), None) => return Err(wrong("https needs certificates".to_owned())),
         _ => return Err(wrong("not an http url".to_owned())),
     };
     Ok(endpoint
@@ -44,21 +200,41 @@ pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, Url
         .initial_connection_window_size(16 << 20))
 }
 
-/// A channel that connects with the first call and again whenever it is broken.
-pub fn lazy_channel(url: &str) -> Result<Channel, UrlError> {
-    Ok(endpoint(url)?.connect_lazy())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_url_without_scheme_is_refused_with_the_form() {
-        for url in ["", "localhost:7000", "127.0.0.1:7000", "ftp://x:1", "http://"] {
+        for url in ["", "localhost:7000", "127.0.0.1:7000", "ftp://x:1", "http://", "https://x:1"] {
             let error = endpoint(url).unwrap_err().to_string();
             assert!(error.contains("http://host:port"), "{error}");
         }
         endpoint("http://localhost:7000").unwrap();
+    }
+
+    #[test]
+    fn a_token_travels_encrypted_or_stays_on_the_machine() {
+        let settings = Settings { token: Some(Token::new(" s3cret\n", "here").unwrap()), ..Settings::default() };
+        for url in ["http://localhost:1", "http://127.0.0.1:1", "http://127.9.9.9:1", "http://[::1]:1"] {
+            settings.endpoint(url).unwrap();
+        }
+        for url in ["http://10.0.0.1:1", "http://learner:1", "http://localhost.evil:1", "http://[2001:db8::1]:1"] {
+            let error = settings.endpoint(url).unwrap_err();
+            assert!(matches!(error, UrlError::Exposed(_)), "{error}");
+            Settings { insecure: true, ..settings.clone() }.endpoint(url).unwrap();
+            Settings::default().endpoint(url).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_token_is_sent_and_never_shown() {
+        let token = Token::new(" s3cret\n", "here").unwrap();
+        let request = Bearer(Some(token.clone())).call(Request::new(())).unwrap();
+        assert_eq!(request.metadata().get("authorization").unwrap(), "Bearer s3cret");
+        assert!(!format!("{request:?}{token:?}").contains("s3cret"));
+        for text in ["", " \n", "two words", "two\nlines", "ümlaut"] {
+            assert!(Token::new(text, "MAGEX_TOKEN").unwrap_err().to_string().starts_with("MAGEX_TOKEN: "));
+        }
     }
 }

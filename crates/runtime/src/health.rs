@@ -1,4 +1,7 @@
-//! Health that tells the truth: not serving until the service says so, and not serving while it drains.
+//! Health that tells the truth: not serving until the service says so, and not serving while it drains. [`probe`] asks for
+//! it.
+
+pub mod probe;
 
 use tonic::server::NamedService;
 use tonic_health::ServingStatus;

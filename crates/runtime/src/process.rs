@@ -2,6 +2,7 @@
 
 use std::io::Write as _;
 use std::net::SocketAddr;
+use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
 /// The tensor library must not start threads of its own: it reads these before anything else runs.
@@ -14,7 +15,12 @@ pub fn single_threaded_math() -> std::io::Result<Option<Command>> {
         return Ok(None);
     }
     let mut command = Command::new(std::env::current_exe()?);
-    command.args(std::env::args_os().skip(1));
+    let mut arguments = std::env::args_os();
+    if let Some(name) = arguments.next() {
+        // The name by which it was called may say what it shall do.
+        command.arg0(name);
+    }
+    command.args(arguments);
     for (name, value) in SINGLE_THREADED {
         if std::env::var_os(name).is_none() {
             command.env(name, value);
@@ -25,21 +31,22 @@ pub fn single_threaded_math() -> std::io::Result<Option<Command>> {
 
 /// Replaces this process with one whose tensor kernels are single-threaded, unless it is such a process already.
 pub fn ensure_single_threaded_math() -> std::io::Result<()> {
-    use std::os::unix::process::CommandExt as _;
     match single_threaded_math()? {
         Some(mut command) => Err(command.exec()),
         None => Ok(()),
     }
 }
 
-/// The line that tells a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`.
-pub fn ready_line(service: &str, address: Option<SocketAddr>) -> String {
-    let address = address.map(|address| address.to_string());
+/// The line that tells a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`,
+/// with `"http"` and where it shows its metrics as a last key if it does.
+pub fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) -> String {
+    let json = |address: SocketAddr| serde_json::Value::from(address.to_string());
+    let http = http.map_or_else(String::new, |http| format!(",\"http\":{}", json(http)));
     // Written out so that the order of the keys is the documented one.
     format!(
-        "{{\"ready\":true,\"service\":{},\"address\":{}}}",
+        "{{\"ready\":true,\"service\":{},\"address\":{}{http}}}",
         serde_json::Value::from(service),
-        serde_json::Value::from(address)
+        address.map_or(serde_json::Value::Null, json)
     )
 }
 
@@ -48,6 +55,22 @@ pub fn default_name() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let host = if host.trim().is_empty() { "host" } else { host.trim() };
     format!("{host}-{}", std::process::id())
+}
+
+/// Files that this process may have open at once.
+pub fn open_files() -> usize {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+    limit.map_or(usize::MAX, |limit| usize::try_from(limit).unwrap_or(usize::MAX))
+}
+
+/// Lets a service open as many files as the system allows it: connections are files.
+pub fn allow_open_files() {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile);
+    let most = rustix::process::Rlimit { current: limit.maximum, ..limit };
+    // Without it there is room for fewer connections.
+    if let Err(error) = rustix::process::setrlimit(rustix::process::Resource::Nofile, most) {
+        tracing::debug!(%error, "the limit of open files stays as it is");
+    }
 }
 
 /// The processors that this process may use.
@@ -62,10 +85,10 @@ pub fn print(text: &str) {
 }
 
 /// Prints [`ready_line`] to standard output: the only thing a running service ever writes there.
-pub fn announce_ready(service: &str, address: Option<SocketAddr>) {
+pub fn announce_ready(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) {
     let mut stdout = std::io::stdout().lock();
     // A supervisor that closed the pipe does not want to know.
-    let _ = writeln!(stdout, "{}", ready_line(service, address)).and_then(|()| stdout.flush());
+    let _ = writeln!(stdout, "{}", ready_line(service, address, http)).and_then(|()| stdout.flush());
 }
 
 #[cfg(test)]
@@ -74,8 +97,11 @@ mod tests {
 
     #[test]
     fn the_ready_line_is_json() {
-        let line = ready_line("learner", Some(([127, 0, 0, 1], 12345).into()));
+        let at = |port: u16| Some(([127, 0, 0, 1], port).into());
+        let line = ready_line("learner", at(12345), None);
         assert_eq!(line, r#"{"ready":true,"service":"learner","address":"127.0.0.1:12345"}"#);
-        assert_eq!(ready_line("actor", None), r#"{"ready":true,"service":"actor","address":null}"#);
+        assert_eq!(ready_line("actor", None, None), r#"{"ready":true,"service":"actor","address":null}"#);
+        let line = ready_line("actor", None, at(9102));
+        assert_eq!(line, r#"{"ready":true,"service":"actor","address":null,"http":"127.0.0.1:9102"}"#);
     }
 }

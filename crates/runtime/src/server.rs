@@ -1,5 +1,8 @@
 //! Listening and serving.
 
+pub use crate::connections::Incoming;
+use crate::connections::{ConnectionLimits, Connections};
+use crate::door::Open;
 use crate::tls::{ServerTls, TlsError};
 use std::future::Future;
 use std::io::{Error, ErrorKind};
@@ -8,30 +11,42 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Server;
-use tonic::transport::server::{Router, TcpIncoming};
+use tonic::transport::server::Router;
 pub use tonic_reflection::server::Error as ReflectionError;
 
 /// How long a server that was told to stop waits for its peers before it leaves them: with what else a service does at its
 /// end, within the budget of 10 s. Streams of ours end at once; this is for peers that say nothing.
 pub const GRACE: Duration = Duration::from_secs(3);
 
+/// The option that says where a service listens.
+const LISTEN: &str = "--listen";
+
 /// A socket that cannot be listened on.
 #[derive(Debug, thiserror::Error)]
 pub enum BindError {
     /// The address makes no sense.
-    #[error("'{0}' is not an address to listen on: use the form host:port, for example --listen 127.0.0.1:7000")]
-    Address(String),
+    #[error("'{address}' is not an address to listen on: use the form host:port, for example {option} 127.0.0.1:7000")]
+    Address {
+        /// What was given.
+        address: String,
+        /// The option that sets it.
+        option: &'static str,
+    },
     /// Somebody else listens there.
-    #[error("port {port} is in use ({address}): choose another with --listen, or port 0 for any free one")]
+    #[error("port {port} is in use ({address}): choose another with {option}, or port 0 for any free one")]
     InUse {
+        /// The option that sets it.
+        option: &'static str,
         /// The address.
         address: String,
         /// Its port.
         port: u16,
     },
     /// Anything else.
-    #[error("cannot listen on {address}: {source}; choose another with --listen")]
+    #[error("cannot listen on {address}: {source}; choose another with {option}")]
     Other {
+        /// The option that sets it.
+        option: &'static str,
         /// The address.
         address: String,
         /// What the system says.
@@ -40,20 +55,26 @@ pub enum BindError {
 }
 
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
-pub async fn bind(listen: &str) -> Result<(TcpIncoming, SocketAddr), BindError> {
-    let address = resolve(listen)?;
-    let failed = |source: Error| match source.kind() {
-        ErrorKind::AddrInUse => BindError::InUse { address: listen.to_owned(), port: address.port() },
-        _ => BindError::Other { address: listen.to_owned(), source },
-    };
-    let listener = TcpListener::bind(address).await.map_err(failed)?;
-    let local = listener.local_addr().map_err(failed)?;
+pub async fn bind(listen: &str) -> Result<(Incoming, SocketAddr), BindError> {
+    let (listener, local) = listener(listen, LISTEN).await?;
     Ok((incoming(listener), local))
 }
 
-/// The connections of a listener, without Nagle's delay.
-pub fn incoming(listener: TcpListener) -> TcpIncoming {
-    TcpIncoming::from(listener).with_nodelay(Some(true))
+/// Listens on the address that an option gave.
+pub(crate) async fn listener(listen: &str, option: &'static str) -> Result<(TcpListener, SocketAddr), BindError> {
+    let wanted = resolve_for(listen, option)?;
+    let failed = |source: Error| match source.kind() {
+        ErrorKind::AddrInUse => BindError::InUse { option, address: listen.to_owned(), port: wanted.port() },
+        _ => BindError::Other { option, address: listen.to_owned(), source },
+    };
+    let listener = TcpListener::bind(wanted).await.map_err(failed)?;
+    let local = listener.local_addr().map_err(failed)?;
+    Ok((listener, local))
+}
+
+/// The connections of a listener, within the usual limits.
+pub fn incoming(listener: TcpListener) -> Incoming {
+    Incoming::new(listener, ConnectionLimits::default())
 }
 
 /// A server with our settings: mute peers are noticed within 15 s, and no connection opens streams without bound.
@@ -62,6 +83,7 @@ pub fn builder() -> Server {
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(5)))
         .max_concurrent_streams(256)
+        .http2_max_header_list_size(16 << 10)
         .initial_stream_window_size(8 << 20)
         .initial_connection_window_size(16 << 20)
 }
@@ -82,7 +104,11 @@ pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, TlsError> {
 /// # Errors
 /// It makes no sense.
 pub fn resolve(listen: &str) -> Result<SocketAddr, BindError> {
-    let wrong = || BindError::Address(listen.to_owned());
+    resolve_for(listen, LISTEN)
+}
+
+fn resolve_for(listen: &str, option: &'static str) -> Result<SocketAddr, BindError> {
+    let wrong = || BindError::Address { address: listen.to_owned(), option };
     listen.to_socket_addrs().map_err(|_| wrong())?.next().ok_or_else(wrong)
 }
 
@@ -90,7 +116,7 @@ pub fn resolve(listen: &str) -> Result<SocketAddr, BindError> {
 /// A connection that never says anything cannot hold it up.
 pub async fn serve(
     router: Router,
-    incoming: TcpIncoming,
+    incoming: Incoming,
     shutdown: CancellationToken,
     grace: Duration,
 ) -> Result<(), tonic::transport::Error> {
@@ -105,7 +131,11 @@ pub async fn serve(
 }
 
 /// The future's value, unless it is not there `grace` after `shutdown`.
-async fn within<T>(future: impl Future<Output = T>, shutdown: CancellationToken, grace: Duration) -> Option<T> {
+pub(crate) async fn within<T>(
+    future: impl Future<Output = T>,
+    shutdown: CancellationToken,
+    grace: Duration,
+) -> Option<T> {
     tokio::select! {
         value = future => Some(value),
         () = async { shutdown.cancelled().await; tokio::time::sleep(grace).await } => None,
@@ -113,13 +143,21 @@ async fn within<T>(future: impl Future<Output = T>, shutdown: CancellationToken,
 }
 
 /// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set; health is described too.
-pub fn with_reflection(router: Router, descriptors: &'static [u8]) -> Result<Router, ReflectionError> {
+///
+/// # Errors
+/// Descriptors that cannot be read.
+pub fn with_reflection(
+    router: Router,
+    descriptors: &'static [u8],
+    connections: &Connections,
+) -> Result<Router, ReflectionError> {
     let describe = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(descriptors)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    Ok(router.add_service(describe().build_v1()?).add_service(describe().build_v1alpha()?))
+    let router = router.add_service(Open::new(describe().build_v1()?, connections.clone()));
+    Ok(router.add_service(Open::new(describe().build_v1alpha()?, connections.clone())))
 }
 
 #[cfg(test)]

@@ -31,11 +31,14 @@ pub fn retry_delay(status: &Status) -> Option<Duration> {
     status.get_details_retry_info().and_then(|info| info.retry_delay)
 }
 
-/// A later attempt of the same call may succeed. What tonic makes of a broken connection (UNKNOWN, CANCELLED) counts.
+/// A later attempt of the same call may succeed. What tonic makes of a broken connection counts, whatever its code: no server
+/// said it, so it has a cause. So does what arrived damaged.
 pub fn is_transient(status: &Status) -> bool {
-    matches!(
+    let own = std::error::Error::source(status).is_some();
+    own || matches!(
         status.code(),
         Code::Unavailable
+            | Code::DataLoss
             | Code::DeadlineExceeded
             | Code::Cancelled
             | Code::Unknown

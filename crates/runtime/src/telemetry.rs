@@ -1,7 +1,30 @@
-//! Logs, on standard error.
+//! Logs on standard error, and traces to a collector when asked for.
 
+use crate::client::{self, UrlError};
+use crate::trace;
+use opentelemetry::KeyValue;
+use opentelemetry::trace::TracerProvider as _;
+use opentelemetry_otlp::{WithExportConfig as _, WithTonicConfig as _};
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::error::OTelSdkResult;
+use opentelemetry_sdk::trace::{BatchConfigBuilder, BatchSpanProcessor, SdkTracerProvider, SpanData, SpanExporter};
 use std::io::IsTerminal as _;
-use tracing_subscriber::EnvFilter;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+use tracing::{Metadata, Subscriber};
+use tracing_subscriber::filter::{EnvFilter, FilterExt as _, filter_fn};
+use tracing_subscriber::layer::{Layer, SubscriberExt as _};
+use tracing_subscriber::registry::LookupSpan;
+use tracing_subscriber::util::SubscriberInitExt as _;
+
+/// How long the end of a process waits for a collector to take the last spans.
+const FLUSH: Duration = Duration::from_secs(1);
+/// A collector that takes longer for a batch does not get it.
+const EXPORT: Duration = Duration::from_secs(3);
+/// Spans are sent at least so often.
+const DELAY: Duration = Duration::from_secs(1);
+/// Spans that wait to be sent; more are dropped.
+const WAITING: usize = 8192;
 
 /// How log lines look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -13,12 +36,150 @@ pub enum LogFormat {
     Json,
 }
 
-/// Sends logs to standard error. `RUST_LOG` sets what is shown, `info` without it. A second call changes nothing.
-pub fn init(format: LogFormat) {
+/// The option of every service that can be traced.
+#[derive(Debug, Clone, Default, clap::Args, serde::Serialize)]
+pub struct TraceArgs {
+    /// Collector that traces are sent to (OpenTelemetry over gRPC), for example http://127.0.0.1:4317 [default: none]
+    #[arg(long, env = "MAGEX_OTLP", value_name = "URL")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub otlp: Option<String>,
+}
+
+/// Why telemetry could not be set up.
+#[derive(Debug, thiserror::Error)]
+pub enum TelemetryError {
+    /// The collector's address.
+    #[error("--otlp: {0}")]
+    Url(#[from] UrlError),
+    /// The exporter.
+    #[error("--otlp: traces cannot be exported: {0}")]
+    Exporter(#[from] opentelemetry_otlp::ExporterBuildError),
+}
+
+/// What must be told when the process ends.
+#[derive(Debug)]
+#[must_use = "spans that wait to be sent are lost without a flush"]
+pub struct Telemetry {
+    traces: Option<SdkTracerProvider>,
+}
+
+impl Telemetry {
+    /// Sends what is waiting to be sent, and gives up after a second. Blocks; the runtime must still be there.
+    pub fn flush(self) {
+        if let Some(traces) = self.traces
+            && let Err(error) = traces.shutdown_with_timeout(FLUSH)
+        {
+            tracing::debug!(%error, "the last spans were not sent");
+        }
+    }
+}
+
+/// Sends logs to standard error, and the spans of [`trace::TARGET`] to a collector if there is one. `RUST_LOG` sets what is
+/// logged, `info` without it. A second call changes nothing. Must be called within a runtime, which the exporter uses.
+///
+/// # Errors
+/// The collector's address makes no sense. That nobody answers there is no error: spans are dropped.
+pub fn init(service: &'static str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, TelemetryError> {
+    let traces = args.otlp.as_deref().map(|url| provider(service, url)).transpose()?;
+    let spans = traces.as_ref().map(|traces| {
+        tracing_opentelemetry::layer()
+            .with_tracer(traces.tracer("magex"))
+            .with_location(false)
+            .with_threads(false)
+            .with_tracked_inactivity(false)
+            .with_filter(filter_fn(is_traced))
+    });
+    // A second call changes nothing.
+    let _ = tracing_subscriber::registry().with(logs(format)).with(spans).try_init();
+    Ok(Telemetry { traces })
+}
+
+fn is_traced(metadata: &Metadata<'_>) -> bool {
+    metadata.target() == trace::TARGET
+}
+
+fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat) -> impl Layer<S> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    let _ = match format {
-        LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).with_target(false).try_init(),
-        LogFormat::Json => builder.json().flatten_event(true).try_init(),
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let lines = match format {
+        LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).with_target(false).boxed(),
+        LogFormat::Json => lines.json().flatten_event(true).boxed(),
     };
+    // Spans of traces are none of the log's business, whatever RUST_LOG says.
+    lines.with_filter(filter.and(filter_fn(|metadata| !is_traced(metadata))))
+}
+
+fn provider(service: &'static str, url: &str) -> Result<SdkTracerProvider, TelemetryError> {
+    let exporter = opentelemetry_otlp::SpanExporter::builder()
+        .with_tonic()
+        .with_channel(client::endpoint_from_env(url)?.connect_lazy())
+        .with_timeout(EXPORT)
+        .build()?;
+    let exporter = Watched { exporter, away: AtomicBool::new(false) };
+    // A thread of its own sends; who makes spans never waits for it.
+    let batches = BatchConfigBuilder::default().with_max_queue_size(WAITING).with_scheduled_delay(DELAY).build();
+    let process = KeyValue::new("service.instance.id", crate::process::default_name());
+    let resource = Resource::builder().with_service_name(service).with_attribute(process).build();
+    let processor = BatchSpanProcessor::builder(exporter).with_batch_config(batches).build();
+    Ok(SdkTracerProvider::builder().with_span_processor(processor).with_resource(resource).build())
+}
+
+/// Says once that the collector is away, and once that it is back.
+#[derive(Debug)]
+struct Watched {
+    exporter: opentelemetry_otlp::SpanExporter,
+    away: AtomicBool,
+}
+
+impl SpanExporter for Watched {
+    async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
+        let result = self.exporter.export(batch).await;
+        match (&result, self.away.swap(result.is_err(), Ordering::Relaxed)) {
+            (Err(error), false) => tracing::warn!(%error, "traces are not taken; they are dropped until they are"),
+            (Ok(()), true) => tracing::info!("traces are taken again"),
+            _ => {}
+        }
+        result
+    }
+
+    fn shutdown_with_timeout(&self, timeout: Duration) -> OTelSdkResult {
+        self.exporter.shutdown_with_timeout(timeout)
+    }
+
+    fn force_flush(&self) -> OTelSdkResult {
+        self.exporter.force_flush()
+    }
+
+    fn set_resource(&mut self, resource: &Resource) {
+        self.exporter.set_resource(resource);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+
+    #[tokio::test]
+    async fn a_collector_that_is_not_there_costs_no_time() {
+        let nobody = crate::http::bind("127.0.0.1:0").await.unwrap().address();
+        let traces = provider("test", &format!("http://{nobody}")).unwrap();
+        let start = Instant::now();
+        let layer = tracing_opentelemetry::layer().with_tracer(traces.tracer("test"));
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(layer), || {
+            // More than may wait.
+            (0..3 * WAITING).for_each(|i| drop(tracing::info_span!(target: trace::TARGET, parent: None, "span", i)));
+        });
+        let flushing = tokio::task::spawn_blocking(|| Telemetry { traces: Some(traces) }.flush());
+        flushing.await.unwrap();
+        // Generous: it is seconds where it could be minutes.
+        assert!(start.elapsed() < Duration::from_secs(30), "{:?}", start.elapsed());
+    }
+
+    #[tokio::test]
+    async fn an_address_that_makes_no_sense_is_named() {
+        let args = TraceArgs { otlp: Some("collector:4317".into()) };
+        let error = init("test", LogFormat::Text, &args).unwrap_err().to_string();
+        assert!(error.starts_with("--otlp: ") && error.contains("http://host:port"), "{error}");
+    }
 }

@@ -61,7 +61,7 @@ impl ServerTls {
 }
 
 /// Whom a client trusts, and its own certificate if the server wants one.
-#[derive(Clone)]
+#[derive(Clone, PartialEq, Eq)]
 pub struct ClientTls {
     ca: Vec<u8>,
     identity: Option<(Vec<u8>, Vec<u8>)>,
@@ -94,9 +94,8 @@ impl ClientTls {
     pub fn from_env() -> Result<Self, TlsError> {
         let path = |name: &str| std::env::var_os(name).map(PathBuf::from);
         let ca = path("MAGEX_TLS_CA").ok_or_else(|| {
-            TlsError::Unusable(
-                "set MAGEX_TLS_CA to the file of the authority that signed the server's certificate".into(),
-            )
+            let problem = "set MAGEX_TLS_CA to the file of the authority that signed the service's certificate";
+            TlsError::Unusable(problem.to_owned())
         })?;
         Self::read(&ca, path("MAGEX_TLS_CERT").as_deref(), path("MAGEX_TLS_KEY").as_deref())
     }

@@ -116,3 +116,62 @@ fn no_checkpoint_and_another_architecture_are_clear_errors() {
     let error = read(&folder, &other).unwrap_err().to_string();
     assert!(error.contains("actor.own.weight"), "{error}");
 }
+
+#[test]
+fn a_flip_anywhere_in_the_manifest_never_gives_anything_but_one_of_the_two_checkpoints() {
+    let run = tempfile::tempdir().unwrap();
+    let (old, mut new) = (moved(learned()), moved(learned()));
+    new.executor.actor.numbers[0] += 1.0;
+    write(run.path(), &progress(1, &old), &old, 3).unwrap();
+    let path = write(run.path(), &progress(2, &new), &new, 3).unwrap().join("manifest.json");
+    let whole = std::fs::read(&path).unwrap();
+    for place in 0..whole.len() {
+        let mut bytes = whole.clone();
+        bytes[place] ^= 1 << (place % 8);
+        std::fs::write(&path, bytes).unwrap();
+        let (found, state, _) = read_latest(run.path(), &old).unwrap_or_else(|error| panic!("byte {place}: {error}"));
+        assert!((found.iteration, &state) == (1, &old) || (found.iteration, &state) == (2, &new), "byte {place}");
+    }
+}
+
+#[test]
+fn a_checkpoint_that_was_moved_aside_is_found_as_long_as_nothing_is_in_its_place() {
+    let run = tempfile::tempdir().unwrap();
+    let state = learned();
+    let folder = write(run.path(), &progress(2, &state), &state, 1).unwrap();
+    let aside = folder.with_file_name(".000002.old");
+    std::fs::rename(&folder, &aside).unwrap();
+    assert_eq!(read_latest(run.path(), &state).unwrap().0.iteration, 2);
+    write(run.path(), &progress(2, &state), &state, 1).unwrap();
+    assert_eq!(list(run.path()).unwrap(), [folder]);
+    assert!(!aside.exists());
+}
+
+#[test]
+fn when_all_are_damaged_the_newest_is_named() {
+    let run = tempfile::tempdir().unwrap();
+    let state = learned();
+    for iteration in [1, 2] {
+        let folder = write(run.path(), &progress(iteration, &state), &state, 3).unwrap();
+        std::fs::write(folder.join("weights.safetensors"), b"x").unwrap();
+    }
+    let error = read_latest(run.path(), &state).unwrap_err().to_string();
+    assert!(error.contains("none of 2 checkpoints") && error.contains("000002/weights.safetensors"), "{error}");
+}
+
+#[test]
+fn what_a_kill_left_half_written_is_removed_and_nothing_else() {
+    let run = tempfile::tempdir().unwrap();
+    let changed = moved(learned());
+    write(run.path(), &progress(12, &changed), &changed, 3).unwrap();
+    let checkpoints = run.path().join("checkpoints");
+    for name in [".000013.tmp", ".000009.old", ".notes.tmp", "mine"] {
+        fs::create_dir(checkpoints.join(name)).unwrap();
+    }
+    fs::write(checkpoints.join(".000013.tmp/weights.safetensors"), "half").unwrap();
+    clean(run.path());
+    let left = |name: &str| checkpoints.join(name).exists();
+    assert!(!left(".000013.tmp"));
+    assert!(left("000012") && left(".000009.old") && left(".notes.tmp") && left("mine"));
+    clean(&run.path().join("nowhere"));
+}

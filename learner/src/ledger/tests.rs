@@ -11,8 +11,8 @@ fn shard(iteration: u32, index: u32) -> Shard {
         kind: ShardKind::Eval,
         iteration: Iteration(iteration),
         index,
-        episodes: 1,
-        first_episode: index,
+        episodes: 1 + index % 3,
+        first_episode: 3 * index,
         version: WeightsVersion(iteration),
         mode: Mode::Greedy,
         eval_set: 1,
@@ -57,6 +57,8 @@ fn the_leases_of_a_lost_actor_come_next_and_in_order() {
     let order: Vec<u32> = std::iter::from_fn(|| ledger.lease(B)).map(|lease| lease.shard.index).collect();
     assert_eq!(order, [0, 1, 2, 3]);
     assert_eq!(ledger.counters(), Counters { leased: 6, expired: 2, outstanding: 4, ..Counters::default() });
+    // Of 1, 2, 3 and 1 episodes.
+    assert_eq!(ledger.episodes(), Counters { leased: 10, expired: 3, outstanding: 7, ..Counters::default() });
 }
 
 #[test]
@@ -67,6 +69,7 @@ fn the_late_result_of_a_lost_lease_counts_once() {
     let again = ledger.lease(B).unwrap();
     assert_eq!(ledger.complete(A, lost.id, result(lost.shard)), Verdict::Accepted);
     assert_eq!(ledger.complete(B, again.id, result(again.shard)), Verdict::Duplicate);
+    assert_eq!(ledger.episodes().residual(), 0);
     let counters = ledger.counters();
     assert_eq!((counters.leased, counters.trained, counters.duplicate, counters.expired), (3, 1, 1, 1));
     assert_eq!(counters.residual(), 0);
@@ -81,19 +84,76 @@ fn a_result_of_another_shard_than_the_leased_one_is_rejected_and_redone() {
     assert_eq!(ledger.counters().residual(), 0);
 }
 
+/// One attempt that fails for good, by an actor whose process has the number of its session.
+fn fail(ledger: &mut Ledger, session: u64, actor: &str, present: &[u64]) {
+    let lease = ledger.lease(SessionId(session)).unwrap();
+    let failure = Failure { actor, process: session, reason: "no such task", present };
+    assert!(ledger.fail(SessionId(session), lease.id, &failure));
+}
+
 #[test]
-fn a_shard_that_nobody_can_do_is_given_up_and_one_that_may_succeed_is_not() {
+fn a_shard_that_may_succeed_is_not_given_up() {
     let mut ledger = opened(1);
     for _ in 0..10 {
         let lease = ledger.lease(A).unwrap();
-        ledger.fail(A, lease.id, "no weights yet", true);
+        ledger.give_back(A, lease.id);
     }
     assert_eq!(ledger.given_up(), None);
-    for _ in 0..MAX_FAILURES {
-        let lease = ledger.lease(A).unwrap();
-        ledger.fail(A, lease.id, "no such task", false);
+    assert_eq!((ledger.counters().failed, ledger.queued()), (10, 1));
+}
+
+#[test]
+fn a_shard_is_given_up_that_three_different_actors_cannot_do() {
+    let mut ledger = opened(1);
+    // Others are there that have not tried.
+    let present = [1, 2, 3, 4];
+    for _ in 0..2 * MAX_FAILURES {
+        fail(&mut ledger, 1, "a", &present);
     }
+    fail(&mut ledger, 2, "b", &present);
+    assert_eq!(ledger.given_up(), None, "two actors");
+    fail(&mut ledger, 3, "c", &present);
     assert_eq!(ledger.given_up().unwrap().reason, "no such task");
+}
+
+#[test]
+fn an_actor_that_is_started_anew_is_no_other_actor() {
+    let mut ledger = opened(1);
+    for process in 1..=2 * u64::from(MAX_FAILURES) {
+        fail(&mut ledger, process, "broken", &[process, 100]);
+    }
+    assert_eq!(ledger.given_up(), None);
+    assert_eq!(ledger.plan[0].failed_at.len(), 1, "those that are gone are forgotten");
+}
+
+#[test]
+fn a_shard_is_given_up_that_everybody_who_is_there_failed_at() {
+    let mut ledger = opened(1);
+    for attempt in 1..=MAX_FAILURES {
+        assert_eq!(ledger.given_up(), None, "attempt {attempt}");
+        fail(&mut ledger, 1, "a", &[1]);
+    }
+    assert!(ledger.given_up().is_some(), "the only one");
+
+    let mut ledger = opened(1);
+    for _ in 0..MAX_FAILURES {
+        fail(&mut ledger, 1, "replica", &[1, 2]);
+    }
+    assert_eq!(ledger.given_up(), None, "one of the same name has not tried");
+    fail(&mut ledger, 2, "replica", &[1, 2]);
+    assert!(ledger.given_up().is_some());
+}
+
+#[test]
+fn a_failure_of_a_lease_that_is_held_no_more_says_nothing() {
+    let mut ledger = opened(1);
+    let lease = ledger.lease(A).unwrap();
+    ledger.drop_actor(A);
+    let failure = Failure { actor: "a", process: 1, reason: "x", present: &[1] };
+    for _ in 0..MAX_FAILURES {
+        assert!(!ledger.fail(A, lease.id, &failure));
+    }
+    assert_eq!(ledger.given_up(), None);
 }
 
 #[test]
@@ -150,7 +210,12 @@ proptest! {
                     ledger.reject(SessionId(actor), lease.id);
                 },
                 Step::Fail { actor, lease, retryable } => if let Some(lease) = pick(lease) {
-                    ledger.fail(SessionId(actor), lease.id, "x", retryable);
+                    if retryable {
+                        ledger.give_back(SessionId(actor), lease.id);
+                    } else {
+                        let failure = Failure { actor: "x", process: actor, reason: "x", present: &[0, 1, 2] };
+                        ledger.fail(SessionId(actor), lease.id, &failure);
+                    }
                 },
                 Step::Drop(actor) => {
                     ledger.drop_actor(SessionId(actor));
@@ -163,6 +228,7 @@ proptest! {
                 }
             }
             prop_assert_eq!(ledger.counters().residual(), 0);
+            prop_assert_eq!(ledger.episodes().residual(), 0);
             let (done, total) = ledger.progress();
             prop_assert!(done <= total);
             if let Some(results) = ledger.take() {
@@ -182,6 +248,7 @@ proptest! {
         prop_assert_eq!(results.map(|r| r.len()), Some(shards as usize));
         prop_assert_eq!(ledger.counters().residual(), 0);
         prop_assert_eq!(ledger.counters().outstanding, 0);
+        prop_assert_eq!((ledger.episodes().residual(), ledger.episodes().outstanding), (0, 0));
         prop_assert!(ledger.counters().trained >= handed_out + u64::from(shards));
     }
 }

@@ -151,7 +151,7 @@ impl Gate {
 struct SlowScheduler(&'static Gate);
 
 impl Scheduler for SlowScheduler {
-    fn assign_batch(&self, _: &GoalRequest) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
         Err(AssignError::Unsupported("not for actors".into()))
     }
 
@@ -177,7 +177,7 @@ fn load_drained(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
 struct BrokenScheduler;
 
 impl Scheduler for BrokenScheduler {
-    fn assign_batch(&self, _: &GoalRequest) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
         panic!("broken")
     }
 

@@ -1,6 +1,7 @@
 //! Actors join, leave, die and fall silent; the batch is always the same.
 
 use crate::sandbox::*;
+use magex_actor::run::ActorError;
 use magex_actor::worker::WorkError;
 use magex_core::ids::Shard;
 use magex_learner::collector::{CollectError, Collector as _};
@@ -124,5 +125,47 @@ async fn a_worker_that_panics_harms_one_shard_only() {
     let again = plan(1, 1);
     assert_eq!(learner.iterate(1, 1).await.unwrap(), expected(&again));
     actor.stop().await;
+    learner.stop().await;
+}
+
+fn always(_: &Shard) -> Result<(), WorkError> {
+    Err(WorkError::fatal("no instruction of this kind"))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_actor_that_can_do_nothing_is_sent_away_and_the_others_go_on() {
+    let mut learner = Learner::start().await;
+    let gate = CancellationToken::new();
+    let busy = FakeWorker { gate: Some(gate.clone()), ..FakeWorker::default() };
+    let good = Actor::start(&learner.url, "good", busy);
+    let broken = Actor::start(&learner.url, "broken", FakeWorker { fail: Some(always), ..FakeWorker::default() });
+    until(|| learner.handle.status().actors.len() == 2).await;
+    learner.collector.publish(&weights(0)).unwrap();
+    learner.collector.open(plan(0, 2)).unwrap();
+    // The good one has its hands full with one of the two.
+    let error = broken.end().await.unwrap_err();
+    assert!(matches!(&error, ActorError::SentAway { reason, .. } if reason.contains("no instruction")), "{error}");
+    gate.cancel();
+    assert_eq!(learner.finish().await.unwrap(), expected(&plan(0, 2)));
+    assert_eq!(learner.ledger().failed, 3);
+    assert_eq!(learner.iterate(1, 3).await.unwrap(), expected(&plan(1, 3)));
+    good.stop().await;
+    learner.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_none_of_its_actors_can_do_ends_with_the_reason() {
+    let mut learner = Learner::start().await;
+    let broken = FakeWorker { fail: Some(always), ..FakeWorker::default() };
+    let actors = ["a", "b"].map(|name| Actor::start(&learner.url, name, broken.clone()));
+    until(|| learner.handle.status().actors.len() == 2).await;
+    let text = learner.iterate(0, 3).await.unwrap_err().to_string();
+    assert!(text.contains("no instruction of this kind"), "{text}");
+    let present = learner.handle.status().actors.len();
+    assert!(present >= 1, "the last one is not sent away");
+    for actor in actors {
+        actor.shutdown.cancel();
+        let _ = actor.end().await;
+    }
     learner.stop().await;
 }

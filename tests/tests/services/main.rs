@@ -3,10 +3,14 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "helpers of tests")]
 
+mod bounds;
+mod certificates;
 mod clients;
 mod commander;
 mod elastic;
+mod floods;
 mod handshake;
+mod hostile;
 mod missions;
 mod results;
 mod sandbox;

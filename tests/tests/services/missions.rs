@@ -143,6 +143,35 @@ async fn missions_survive_a_restart_and_are_bounded_in_number_and_age() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_page_is_cut_before_it_is_too_long_to_take() {
+    let commander = Commander::start("127.0.0.1:0", None).await;
+    let mut client = commander_client(&commander.url).await;
+    let long = "x".repeat(60);
+    let agents: Vec<_> = (0..1000).map(|k| member(&format!("{long}{k}"), [k as f32, 0.0])).collect();
+    let mut expected = Vec::new();
+    for k in 0..60 {
+        let id = format!("m{k:02}");
+        let mission = v1::CreateMissionRequest { agents: agents.clone(), goals: vec![], ..request(&id) };
+        create(&mut client, mission).await;
+        expected.push(id);
+    }
+    // This client takes 4 MiB, as clients do.
+    let (mut names, mut token, mut pages) = (Vec::new(), String::new(), 0);
+    loop {
+        let ask = v1::ListAssignmentsRequest { page_size: 500, page_token: token, ..Default::default() };
+        let (page, next) = list(&mut client, ask).await;
+        names.extend(page);
+        (token, pages) = (next, pages + 1);
+        if token.is_empty() {
+            break;
+        }
+    }
+    assert_eq!(names, expected);
+    assert!(pages > 1, "all of it in one page: the test asks for too little");
+    commander.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn updates_at_the_same_time_lose_nothing() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;

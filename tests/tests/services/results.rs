@@ -86,12 +86,12 @@ async fn a_damaged_part_is_noticed_and_the_rest_of_it_ignored() {
     let bytes = encode_result(&RunId("run".into()), &weights(0).sha256, &good);
     let mut part = parts::split(bytes.clone()).next().unwrap();
     part.crc32c ^= 1;
-    puppet.send(Request::Part(ResultPart { lease_id: lease, part: Some(part) })).await;
+    puppet.send(Request::Part(ResultPart { lease_id: lease, part: Some(part), timing: None })).await;
     let ack = puppet.ack().await;
     assert!(ack.reason.starts_with("part.crc32c: "), "{}", ack.reason);
     let mut long = parts::split(bytes).next().unwrap();
     long.total_bytes = 1 << 40;
-    puppet.send(Request::Part(ResultPart { lease_id: lease, part: Some(long) })).await;
+    puppet.send(Request::Part(ResultPart { lease_id: lease, part: Some(long), timing: None })).await;
     assert!(puppet.ack().await.reason.contains("more than the limit of"));
     puppet.send(Request::Ready(v1::Ready { credit: 1 })).await;
     let (lease, _) = puppet.lease().await;

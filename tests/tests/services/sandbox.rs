@@ -22,6 +22,8 @@ use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::weights::Weights;
 use magex_proto::{PROTOCOL_VERSION, parts, v1};
+use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::security::Security;
 use magex_runtime::{client, server};
 use std::sync::Arc;
 use std::time::Duration;
@@ -114,14 +116,25 @@ pub(crate) struct LearnerOptions {
     pub(crate) listen: String,
     pub(crate) lease: Duration,
     pub(crate) max_actors: usize,
+    pub(crate) max_watchers: usize,
     pub(crate) task: TaskConfig,
     pub(crate) max_episodes: usize,
+    pub(crate) security: Security,
 }
 
 impl Default for LearnerOptions {
     fn default() -> Self {
         let lease = Duration::from_secs(15);
-        Self { listen: "127.0.0.1:0".into(), lease, max_actors: 8, task: task(), max_episodes: 2 }
+        let security = Security::default();
+        Self {
+            listen: "127.0.0.1:0".into(),
+            lease,
+            max_actors: 8,
+            max_watchers: 64,
+            task: task(),
+            max_episodes: 2,
+            security,
+        }
     }
 }
 
@@ -139,11 +152,15 @@ impl Learner {
             seed: SEED,
             lease: options.lease,
         };
-        let limits = Limits { max_actors: options.max_actors, ..Limits::for_task(&options.task, options.max_episodes) };
+        let limits = Limits {
+            max_actors: options.max_actors,
+            max_watchers: options.max_watchers,
+            ..Limits::for_task(&options.task, options.max_episodes)
+        };
         let (handle, collector) = learner_service(run, limits);
         let (incoming, address) = server::bind(&options.listen).await.unwrap();
         let shutdown = CancellationToken::new();
-        let (served, token) = (handle.clone(), shutdown.clone());
+        let (served, token) = (handle.clone().guarded(options.security), shutdown.clone());
         let serving = tokio::spawn(async move { served.serve(incoming, token).await.unwrap() });
         Self { url: format!("http://{address}"), address, handle, collector, shutdown, serving }
     }
@@ -246,9 +263,17 @@ impl Actor {
     }
 
     pub(crate) fn start_with(config: ActorConfig, worker: FakeWorker) -> Self {
+        Self::start_maker(config, worker.maker())
+    }
+
+    pub(crate) fn start_maker(config: ActorConfig, maker: MakeWorker) -> Self {
         let shutdown = CancellationToken::new();
-        let running = tokio::spawn(magex_actor::run::run(config, worker.maker(), shutdown.clone()));
+        let running = tokio::spawn(magex_actor::run::run(config, maker, shutdown.clone()));
         Self { shutdown, running }
+    }
+
+    pub(crate) fn has_ended(&self) -> bool {
+        self.running.is_finished()
     }
 
     pub(crate) async fn stop(self) -> ActorReport {
@@ -265,6 +290,7 @@ pub(crate) fn config(learner_url: &str, name: &str) -> ActorConfig {
     ActorConfig {
         learner_url: learner_url.into(),
         commander_url: "http://127.0.0.1:9".into(),
+        client: client::Settings::default(),
         actor_id: name.into(),
         threads: 1,
         expected_task: None,
@@ -332,7 +358,7 @@ impl Puppet {
 
     pub(crate) async fn send_bytes(&self, lease_id: u64, bytes: Bytes) {
         for part in parts::split(bytes) {
-            self.send(Request::Part(v1::ResultPart { lease_id, part: Some(part) })).await;
+            self.send(Request::Part(v1::ResultPart { lease_id, part: Some(part), timing: None })).await;
         }
     }
 }
@@ -345,7 +371,7 @@ pub(crate) async fn learner_client(url: &str) -> LearnerServiceClient<Channel> {
 pub(crate) struct FakeScheduler;
 
 impl Scheduler for FakeScheduler {
-    fn assign_batch(&self, request: &GoalRequest) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, request: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
         let b = request.shard.episodes as usize * request.stages;
         let n = request.agent_count as u32;
         let goals = (0..b).flat_map(|_| 0..n).collect();
@@ -384,6 +410,15 @@ impl Commander {
         let (incoming, address) = server::bind(listen).await.unwrap();
         let shutdown = CancellationToken::new();
         let run = magex_commander::service::run(config, load, incoming, shutdown.clone());
+        let serving = tokio::spawn(async move { run.await.unwrap() });
+        Self { url: format!("http://{address}"), shutdown, serving }
+    }
+
+    /// With a limited number of connections.
+    pub(crate) async fn start_within(limits: ConnectionLimits, config: CommanderConfig) -> Self {
+        let (incoming, address) = server::bind("127.0.0.1:0").await.unwrap();
+        let shutdown = CancellationToken::new();
+        let run = magex_commander::service::run(config, load_fake, incoming.within(limits), shutdown.clone());
         let serving = tokio::spawn(async move { run.await.unwrap() });
         Self { url: format!("http://{address}"), shutdown, serving }
     }

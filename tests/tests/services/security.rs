@@ -1,26 +1,23 @@
-//! Who is let in: tokens, certificates, roles and limits.
+//! Who is let in: tokens, roles and limits.
 
 use crate::clients::{positions, team};
 use crate::sandbox::*;
-use magex_commander::access::Access;
 use magex_commander::service::CommanderConfig;
 use magex_dispatch::Limits;
+use magex_learner::collector::Collector as _;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
+use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::weights::sha256_hex;
-use magex_runtime::client::endpoint_with;
-use magex_runtime::tls::{ClientTls, ServerTls};
-use std::path::{Path, PathBuf};
-use tonic::metadata::MetadataValue;
-use tonic::service::interceptor::InterceptedService;
-use tonic::transport::Channel;
-use tonic::{Code, Request, Status};
+use magex_runtime::access::Access;
+use magex_runtime::client::{Channel, Settings, Token};
+use magex_runtime::security::Security;
+use std::path::Path;
+use tonic::{Code, Status};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
-type Client<F> = CommanderServiceClient<InterceptedService<Channel, F>>;
-
-fn identities(folder: &Path, entries: &[(&str, &str, &str, &str)]) -> Access {
+pub(crate) fn identities(folder: &Path, entries: &[(&str, &str, &str, &str)]) -> Access {
     let mut text = String::new();
     for (name, role, kind, hash) in entries {
         text += &format!("[[identity]]\nname = '{name}'\nrole = '{role}'\n{kind}_sha256 = '{hash}'\n");
@@ -30,141 +27,173 @@ fn identities(folder: &Path, entries: &[(&str, &str, &str, &str)]) -> Access {
     Access::read(&path).unwrap()
 }
 
-fn bearing(channel: Channel, token: &str) -> Client<impl FnMut(Request<()>) -> Result<Request<()>, Status> + Clone> {
-    let value: MetadataValue<_> = format!("Bearer {token}").parse().unwrap();
-    CommanderServiceClient::with_interceptor(channel, move |mut request: Request<()>| {
-        request.metadata_mut().insert("authorization", value.clone());
-        Ok(request)
-    })
+/// Settings with this token.
+pub(crate) fn bearing(token: &str) -> Settings {
+    Settings { token: Some(Token::new(token, "test").unwrap()), ..Settings::default() }
 }
 
-fn code<T>(result: Result<T, Status>) -> Option<Code> {
+pub(crate) async fn commander_as(url: &str, token: &str) -> CommanderServiceClient<Channel> {
+    CommanderServiceClient::new(bearing(token).connect(url).await.unwrap())
+}
+
+pub(crate) fn code<T>(result: Result<T, Status>) -> Option<Code> {
     result.err().map(|status| status.code())
 }
 
+/// Everybody that the tests know, by token; the name is the token, too.
+pub(crate) fn everybody(folder: &Path) -> Access {
+    let roles =
+        [("fleet", "client"), ("other", "client"), ("rollouts", "actor"), ("goals", "commander"), ("ops", "admin")];
+    let hashes = roles.map(|(name, _)| sha256_hex(name.as_bytes()));
+    let entries: Vec<_> =
+        roles.iter().zip(&hashes).map(|((name, role), hash)| (*name, *role, "token", hash.as_str())).collect();
+    identities(folder, &entries)
+}
+
+pub(crate) fn guarded(access: Access) -> Security {
+    Security { access, ..Security::default() }
+}
+
+const DENIED: Option<Code> = Some(Code::PermissionDenied);
+const UNKNOWN: Option<Code> = Some(Code::Unauthenticated);
+const INVALID: Option<Code> = Some(Code::InvalidArgument);
+const MISSING: Option<Code> = Some(Code::NotFound);
+
 #[tokio::test(flavor = "multi_thread")]
-async fn every_role_opens_its_own_doors_and_missions_are_their_owners() {
+async fn every_method_of_the_commander_opens_for_its_roles_only() {
     let folder = tempfile::tempdir().unwrap();
-    let hash = |token: &str| sha256_hex(token.as_bytes());
-    let (client, other, actor, admin) = (hash("c"), hash("o"), hash("a"), hash("x"));
-    let entries = [
-        ("fleet", "client", "token", client.as_str()),
-        ("other", "client", "token", other.as_str()),
-        ("rollouts", "actor", "token", actor.as_str()),
-        ("ops", "admin", "token", admin.as_str()),
-    ];
-    let config = CommanderConfig { access: identities(folder.path(), &entries), ..CommanderConfig::default() };
+    let config = CommanderConfig { security: guarded(everybody(folder.path())), ..CommanderConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
-    let channel = magex_runtime::client::endpoint(&commander.url).unwrap().connect().await.unwrap();
-    let shard = plan(0, 1)[0];
-    let key = magex_proto::goals::WeightsKey {
-        run_id: magex_core::ids::RunId("r".into()),
-        version: shard.version,
-        sha256: String::new(),
+    // What a call ends with that was let in: some of these ask for nothing that there is.
+    let let_in = [None, None, None, None, INVALID, MISSING, MISSING, None, None, MISSING, None];
+    let only = |open: &[usize]| {
+        let mut found = [DENIED; 11];
+        open.iter().for_each(|&method| found[method] = let_in[method]);
+        found
     };
-    let batch = || {
-        let mut request = goal_request(&task(), &shard);
-        request.scheduler = magex_proto::goals::SchedulerKind::Exact;
-        request.to_message(&key)
-    };
-    // Token, and what Assign, AssignBatch, GetModel and CreateMission answer.
-    let (denied, unknown) = (Some(Code::PermissionDenied), Some(Code::Unauthenticated));
+    let clients = only(&[0, 1, 2, 3, 5, 6, 7, 8, 9, 10]);
     for (token, expected) in [
-        ("c", [None, denied, None, None]),
-        ("o", [None, denied, None, None]),
-        ("a", [denied, None, None, denied]),
-        ("x", [None, None, None, None]),
-        ("wrong", [unknown; 4]),
+        ("fleet", clients),
+        ("other", clients),
+        ("rollouts", only(&[4, 10])),
+        ("goals", only(&[])),
+        ("ops", let_in),
+        ("wrong", [UNKNOWN; 11]),
     ] {
-        let mut client = bearing(channel.clone(), token);
+        let mut c = commander_as(&commander.url, token).await;
+        let many = v1::AssignManyRequest { teams: vec![team()] };
         let mission = v1::CreateMissionRequest { mission_id: format!("of-{token}"), ..Default::default() };
+        let id = "nowhere".to_owned();
+        let update = v1::UpdateMissionRequest { mission_id: id.clone(), ..Default::default() };
         let found = [
-            code(client.assign(team()).await),
-            code(client.assign_batch(batch()).await),
-            code(client.get_model(v1::GetModelRequest {}).await),
-            code(client.create_mission(mission).await),
+            code(c.assign(team()).await),
+            code(c.assign_many(many).await),
+            code(c.assign_stream(tokio_stream::empty()).await),
+            code(c.create_mission(mission).await),
+            code(c.assign_batch(v1::AssignBatchRequest::default()).await),
+            code(c.update_mission(update).await),
+            code(c.get_assignment(v1::GetAssignmentRequest { mission_id: id.clone() }).await),
+            code(c.list_assignments(v1::ListAssignmentsRequest::default()).await),
+            code(c.watch_assignments(v1::WatchAssignmentsRequest::default()).await),
+            code(c.delete_mission(v1::DeleteMissionRequest { mission_id: id }).await),
+            code(c.get_model(v1::GetModelRequest {}).await),
         ];
         assert_eq!(found, expected, "{token}");
     }
-    let mut nobody = CommanderServiceClient::new(channel.clone());
-    assert_eq!(code(nobody.assign(team()).await), unknown);
+    let mut nobody = commander_client(&commander.url).await;
+    assert_eq!(code(nobody.assign(team()).await), UNKNOWN);
     // Health needs no token.
-    let mut health = HealthClient::new(channel.clone());
-    health.check(HealthCheckRequest { service: String::new() }).await.unwrap();
-    for (token, missions) in [("c", vec!["of-c"]), ("o", vec!["of-o"]), ("x", vec!["of-c", "of-o", "of-x"])] {
-        let mut client = bearing(channel.clone(), token);
+    let channel = magex_runtime::client::endpoint(&commander.url).unwrap().connect().await.unwrap();
+    HealthClient::new(channel).check(HealthCheckRequest { service: String::new() }).await.unwrap();
+    for (token, missions) in
+        [("fleet", vec!["of-fleet"]), ("other", vec!["of-other"]), ("ops", vec!["of-fleet", "of-ops", "of-other"])]
+    {
+        let mut client = commander_as(&commander.url, token).await;
         let own = v1::ListAssignmentsRequest { source: v1::MissionSource::Client.into(), ..Default::default() };
         let page = client.list_assignments(own).await.unwrap().into_inner();
         let names: Vec<&str> = page.assignments.iter().map(|a| a.mission_id.as_str()).collect();
         assert_eq!(names, missions, "{token}");
-        let theirs = v1::DeleteMissionRequest { mission_id: if token == "c" { "of-o" } else { "of-c" }.into() };
-        let expected = if token == "x" { None } else { Some(Code::NotFound) };
+        let theirs = if token == "fleet" { "of-other" } else { "of-fleet" };
+        let theirs = v1::DeleteMissionRequest { mission_id: theirs.into() };
+        let expected = if token == "ops" { None } else { MISSING };
         assert_eq!(code(client.delete_mission(theirs).await), expected, "{token}");
     }
     commander.stop().await;
 }
 
-/// A certificate and its key in files; signed by `authority`, or an authority itself.
-struct Signed {
-    certificate: PathBuf,
-    key: PathBuf,
-    issuer: rcgen::Issuer<'static, rcgen::KeyPair>,
-    der: Vec<u8>,
-}
-
-fn sign(folder: &Path, name: &str, authority: Option<&Signed>) -> Signed {
-    let mut params = rcgen::CertificateParams::new(vec!["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
-    params.distinguished_name.push(rcgen::DnType::CommonName, name);
-    let key = rcgen::KeyPair::generate().unwrap();
-    let certificate = match authority {
-        Some(authority) => params.signed_by(&key, &authority.issuer).unwrap(),
-        None => {
-            params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
-            params.self_signed(&key).unwrap()
-        }
-    };
-    let (path, key_path) = (folder.join(format!("{name}.pem")), folder.join(format!("{name}.key")));
-    std::fs::write(&path, certificate.pem()).unwrap();
-    std::fs::write(&key_path, key.serialize_pem()).unwrap();
-    let der = certificate.der().to_vec();
-    Signed { certificate: path, key: key_path, issuer: rcgen::Issuer::new(params, key), der }
+#[tokio::test(flavor = "multi_thread")]
+async fn every_method_of_the_learner_opens_for_its_roles_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let security = guarded(everybody(folder.path()));
+    let learner = Learner::start_with(LearnerOptions { security, ..LearnerOptions::default() }).await;
+    for (token, expected) in [
+        ("fleet", [DENIED, DENIED, None, None, DENIED, DENIED]),
+        ("rollouts", [None, None, DENIED, DENIED, DENIED, DENIED]),
+        ("goals", [DENIED, None, DENIED, DENIED, DENIED, DENIED]),
+        ("wrong", [UNKNOWN; 6]),
+        // Last: it drains.
+        ("ops", [None; 6]),
+    ] {
+        let mut c = LearnerServiceClient::new(bearing(token).connect(&learner.url).await.unwrap());
+        let found = [
+            code(c.rollout(tokio_stream::pending()).await),
+            code(c.watch_weights(v1::WatchWeightsRequest::default()).await),
+            code(c.get_run(v1::GetRunRequest {}).await),
+            code(c.watch_run(v1::WatchRunRequest {}).await),
+            code(c.checkpoint(v1::CheckpointRequest {}).await),
+            code(c.drain(v1::DrainRequest { reason: "test".into() }).await),
+        ];
+        assert_eq!(found, expected, "{token}");
+    }
+    let mut nobody = learner_client(&learner.url).await;
+    assert_eq!(code(nobody.get_run(v1::GetRunRequest {}).await), UNKNOWN);
+    learner.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn certificates_are_asked_for_checked_and_carry_roles() {
+async fn an_actor_that_is_not_let_in_says_so_and_ends() {
     let folder = tempfile::tempdir().unwrap();
-    let authority = sign(folder.path(), "authority", None);
-    let server = sign(folder.path(), "server", Some(&authority));
-    let (robot, actor) =
-        (sign(folder.path(), "robot", Some(&authority)), sign(folder.path(), "actor", Some(&authority)));
-    let (stranger_ca, unknown) =
-        (sign(folder.path(), "elsewhere", None), sign(folder.path(), "unknown", Some(&authority)));
-    let stranger = sign(folder.path(), "stranger", Some(&stranger_ca));
-    let (robot_hash, actor_hash) = (sha256_hex(&robot.der), sha256_hex(&actor.der));
-    let entries =
-        [("robot", "client", "certificate", robot_hash.as_str()), ("actor", "actor", "certificate", &actor_hash)];
-    let tls = ServerTls::read(&server.certificate, &server.key, Some(&authority.certificate)).unwrap();
-    let access = identities(folder.path(), &entries);
-    let config = CommanderConfig { tls: Some(tls), access, ..CommanderConfig::default() };
-    let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
-    let url = commander.url.replace("http://", "https://");
-    let ask = async |own: Option<&Signed>, ca: &Signed| {
-        let own = own.map(|signed| (signed.certificate.as_path(), signed.key.as_path()));
-        let tls = ClientTls::read(&ca.certificate, own.map(|o| o.0), own.map(|o| o.1)).unwrap();
-        let channel = endpoint_with(&url, Some(&tls)).unwrap().connect_lazy();
-        within(CommanderServiceClient::new(channel).assign(team())).await
-    };
-    assert_eq!(code(ask(Some(&robot), &authority).await), None);
-    assert_eq!(code(ask(Some(&actor), &authority).await), Some(Code::PermissionDenied));
-    assert_eq!(code(ask(Some(&unknown), &authority).await), Some(Code::Unauthenticated));
-    // These do not get as far as a call.
-    for (own, ca) in [(None, &authority), (Some(&stranger), &authority), (Some(&robot), &stranger_ca)] {
-        let status = ask(own, ca).await.unwrap_err();
-        assert!(!matches!(status.code(), Code::Ok | Code::Unauthenticated | Code::PermissionDenied), "{status}");
+    let security = guarded(everybody(folder.path()));
+    let learner = Learner::start_with(LearnerOptions { security, ..LearnerOptions::default() }).await;
+    for (client, words) in [(Settings::default(), "authorization"), (bearing("fleet"), "role client")] {
+        let config = magex_actor::run::ActorConfig { client, ..config(&learner.url, "a") };
+        let error = Actor::start_with(config, FakeWorker::default()).end().await.unwrap_err().to_string();
+        assert!(error.contains("refused") && error.contains(words), "{error}");
     }
-    let plain = endpoint_with(&commander.url, None).unwrap().connect_lazy();
-    assert!(within(CommanderServiceClient::new(plain).assign(team())).await.is_err());
+    learner.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_actor_that_the_commander_does_not_let_in_ends_and_its_shard_is_done_by_another() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = Learner::start().await;
+    let (security, learner_url) = (guarded(everybody(folder.path())), Some(learner.url.clone()));
+    let config = CommanderConfig { security, learner_url, ..CommanderConfig::default() };
+    let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
+    learner.collector.publish(&weights(0)).unwrap();
+    learner.collector.open(plan(0, 3)).unwrap();
+    let asking = |client: Settings| {
+        let config = magex_actor::run::ActorConfig {
+            client,
+            commander_url: commander.url.clone(),
+            ..crate::sandbox::config(&learner.url, "asking")
+        };
+        Actor::start_with(config, FakeWorker { ask_goals: true, ..FakeWorker::default() })
+    };
+    for (client, words) in [(Settings::default(), "authorization"), (bearing("fleet"), "role client")] {
+        let error = asking(client).end().await.unwrap_err().to_string();
+        assert!(error.contains("does not let this actor in") && error.contains(words), "{error}");
+    }
+    // More often than a shard may fail for good.
+    for _ in 0..4 {
+        asking(bearing("wrong")).end().await.unwrap_err();
+    }
+    assert_eq!(learner.ledger().failed, 6);
+    let good = asking(bearing("rollouts"));
+    assert_eq!(learner.finish().await.unwrap(), expected(&plan(0, 3)));
+    good.stop().await;
     commander.stop().await;
+    learner.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

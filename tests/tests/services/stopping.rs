@@ -6,6 +6,7 @@ use magex_learner::collector::{CollectError, Collector as _, IterationReport, Ru
 use magex_proto::v1;
 use magex_proto::v1::watch_run_response::Event;
 use std::time::{Duration, Instant};
+use tokio_util::sync::CancellationToken;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn open_streams_and_idle_sockets_do_not_hold_up_the_end() {
@@ -36,7 +37,7 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     let actor = Actor::start(&learner.url, "a", FakeWorker::default());
     learner.iterate(0, 2).await.unwrap();
     let report = IterationReport {
-        iteration: Iteration(0),
+        iteration: Iteration(1),
         joint_env_steps: 12,
         success: Some(0.5),
         reward: None,
@@ -45,6 +46,7 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     learner.collector.event(RunEvent::Iteration(report));
     let status = learner.handle.status();
     assert_eq!((status.iteration, status.joint_env_steps, status.success), (1, 12, Some(0.5)));
+    assert!(!status.metrics_json.is_empty());
     let mut client = learner_client(&learner.url).await;
     let mut events = client.watch_run(v1::WatchRunRequest {}).await.unwrap().into_inner();
     let first = within(events.message()).await.unwrap().unwrap();
@@ -65,14 +67,58 @@ async fn a_drain_lets_the_iteration_finish() {
     learner.collector.open(plan(0, 2)).unwrap();
     assert_eq!(learner.handle.status().state(), v1::RunState::WaitingForActors);
     let mut client = learner_client(&learner.url).await;
+    let refused = client.checkpoint(v1::CheckpointRequest {}).await.unwrap_err();
+    assert!(refused.code() == tonic::Code::FailedPrecondition && refused.message().contains("no actor"), "{refused}");
+    let gate = CancellationToken::new();
+    let actor = Actor::start(&learner.url, "a", FakeWorker { gate: Some(gate.clone()), ..FakeWorker::default() });
+    until(|| learner.handle.status().state() == v1::RunState::Collecting).await;
     client.checkpoint(v1::CheckpointRequest {}).await.unwrap();
     client.drain(v1::DrainRequest { reason: "new kernel".into() }).await.unwrap();
-    let actor = Actor::start(&learner.url, "a", FakeWorker::default());
+    gate.cancel();
     assert_eq!(learner.finish().await.unwrap(), expected(&plan(0, 2)));
     assert_eq!(learner.collector.stop_requested(), Some(StopReason::Drain("new kernel".into())));
     assert!(learner.collector.checkpoint_requested() && !learner.collector.checkpoint_requested());
     let status = client.get_run(v1::GetRunRequest {}).await.unwrap().into_inner().run.unwrap();
     assert_eq!(status.state(), v1::RunState::Draining);
     actor.stop().await;
+    learner.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_drain_without_anybody_to_finish_the_iteration_ends_it() {
+    // Nobody is there; and whoever is there leaves before it is done.
+    for leaves in [false, true] {
+        let mut learner = Learner::start().await;
+        learner.collector.publish(&weights(0)).unwrap();
+        learner.collector.open(plan(0, 2)).unwrap();
+        let puppet = if leaves { Some(Puppet::ready(&learner.url, 1, 1).await) } else { None };
+        let mut client = learner_client(&learner.url).await;
+        client.drain(v1::DrainRequest { reason: "new kernel".into() }).await.unwrap();
+        within(learner.handle.told()).await;
+        let leaving = tokio::spawn(async move {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            drop(puppet);
+        });
+        let ended = learner.finish().await;
+        assert!(matches!(ended, Err(CollectError::Stopped(StopReason::Drain(_)))), "{ended:?}");
+        leaving.await.unwrap();
+        learner.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_resumed_run_says_at_once_how_it_stood() {
+    let mut learner = Learner::start().await;
+    let before = IterationReport {
+        iteration: Iteration(7),
+        joint_env_steps: 70,
+        success: Some(0.5),
+        reward: Some(-1.0),
+        metrics_json: "{}".into(),
+    };
+    learner.collector.resumed(&before);
+    let status = learner.handle.status();
+    assert_eq!((status.iteration, status.joint_env_steps, status.success), (7, 70, Some(0.5)));
+    assert_eq!((status.reward, status.metrics_json.as_str()), (Some(-1.0), "{}"));
     learner.stop().await;
 }

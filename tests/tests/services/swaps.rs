@@ -15,7 +15,7 @@ use std::time::Duration;
 struct Numbered(u32);
 
 impl Scheduler for Numbered {
-    fn assign_batch(&self, _: &GoalRequest) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
         Err(AssignError::Unsupported("not for actors".into()))
     }
 

@@ -2,7 +2,7 @@
 
 use super::{MissionLimits, Names, TRAINING_PREFIX};
 use crate::DispatchError;
-use crate::problem::{LONGEST_ID, scheduler};
+use crate::problem::{LONGEST_ID, finite_cost, scheduler, switching_cost};
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::SchedulerKind;
 use magex_proto::v1;
@@ -133,4 +133,41 @@ pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i
         return Ok(((seconds * 1e3) as i64).max(1));
     }
     Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is not above 0 and up to {most}")))
+}
+
+/// Refuses a record that no mission can have written: what goes on from it takes for granted what requests are checked for.
+pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Result<(), ConvertError> {
+    let wrong = |field: String, problem: &str| Err(ConvertError::new(field, problem.to_owned()));
+    check_id(&a.mission_id).map_err(|error| ConvertError::new("mission_id", error.to_string()))?;
+    sticky_scheduler(a.scheduler).map_err(|error| ConvertError::new("scheduler", error.to_string()))?;
+    switching_cost(a.switching_cost)?;
+    if a.revision == u64::MAX {
+        return wrong("revision".to_owned(), "there is none after it");
+    }
+    let dims = a.agents.iter().chain(&a.goals).map(|member| member.position.len()).next().unwrap_or(2);
+    for (field, members) in [("agents", &a.agents), ("goals", &a.goals)] {
+        let mut seen = HashSet::new();
+        for (k, member) in members.iter().enumerate() {
+            if member.id.is_empty() || !seen.insert(member.id.as_str()) {
+                return wrong(format!("{field}[{k}].id"), "empty, or the same name occurs before");
+            }
+            let position = &member.position;
+            if position.len() != dims || !(2..=3).contains(&dims) || position.iter().any(|x| !x.is_finite()) {
+                return wrong(format!("{field}[{k}].position"), "not as many finite coordinates as others have");
+            }
+            if !v1::MemberState::try_from(member.state).is_ok_and(|state| state != v1::MemberState::Unspecified) {
+                return wrong(format!("{field}[{k}].state"), "unknown");
+            }
+        }
+    }
+    let (mut agents, mut goals) = (HashSet::new(), HashSet::new());
+    for (k, pair) in a.pairs.iter().enumerate() {
+        if !agents.insert(pair.agent_id.as_str()) || !goals.insert(pair.goal_id.as_str()) {
+            return wrong(format!("pairs[{k}]"), "its agent or its goal is in another pair");
+        }
+    }
+    for (k, item) in overrides.iter().enumerate() {
+        finite_cost(item.cost, || format!("cost_overrides[{k}].cost"))?;
+    }
+    Ok(())
 }

@@ -7,14 +7,14 @@ use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
-use magex_runtime::tls::ClientTls;
-use magex_runtime::{client, exit};
+use magex_runtime::client::ConnectError;
+use magex_runtime::exit;
+use magex_runtime::security::CallerArgs;
 use serde::Deserialize;
 use serde_json::json;
 use std::io::Read as _;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use tonic::{Code, Request, Status};
+use tonic::{Code, Status};
 
 const AFTER_HELP: &str = "\
 Examples:
@@ -37,18 +37,9 @@ pub(crate) struct AssignArgs {
     /// The commander's address.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7100", env = "MAGEX_COMMANDER")]
     pub(crate) connect: String,
-    /// Bearer token, if the commander wants one.
-    #[arg(long, value_name = "TOKEN", env = "MAGEX_TOKEN", hide_env_values = true)]
-    pub(crate) token: Option<String>,
-    /// Authority (PEM) that signed the certificate of an https commander.
-    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_CA")]
-    pub(crate) ca: Option<PathBuf>,
-    /// Own certificate (PEM), if the commander wants one.
-    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_CERT", requires = "key")]
-    pub(crate) cert: Option<PathBuf>,
-    /// Key of that certificate (PEM).
-    #[arg(long, value_name = "FILE", env = "MAGEX_TLS_KEY", requires = "cert")]
-    pub(crate) key: Option<PathBuf>,
+    /// What the commander is shown.
+    #[command(flatten)]
+    pub(crate) security: CallerArgs,
     /// Positions of the agents: JSON, a file, or - for standard input; a team file brings the goals too.
     #[arg(long, value_name = "FILE|JSON|-", required_unless_present = "random", conflicts_with = "random")]
     pub(crate) agents: Option<String>,
@@ -115,26 +106,17 @@ pub(crate) fn run(args: &AssignArgs, global: &Global) -> anyhow::Result<u8> {
         seed: args.seed,
         ..Default::default()
     };
-    let tls = args.ca.as_deref().filter(|_| args.connect.starts_with("https:"));
-    let tls =
-        tls.map(|ca| ClientTls::read(ca, args.cert.as_deref(), args.key.as_deref())).transpose().map_err(usage)?;
-    let endpoint = client::endpoint_with(&args.connect, tls.as_ref());
-    let endpoint = endpoint.map_err(|error| match args.ca.is_none() && args.connect.starts_with("https:") {
-        true => usage(format!("--connect: {error}; name the authority of its certificate with --ca")),
-        false => usage(format!("--connect: {error}")),
-    })?;
-    let mut request = Request::new(request);
-    if let Some(token) = &args.token {
-        let value = format!("Bearer {token}").parse().map_err(|_| usage("--token: it must be printable ASCII"))?;
-        request.metadata_mut().insert("authorization", value);
-    }
+    let settings = args.security.read().map_err(usage)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let clock = Instant::now();
     let response = runtime.block_on(async {
-        let channel = endpoint.connect().await.map_err(|error| {
-            let reason = anyhow::Error::new(error);
-            let reason = reason.root_cause();
-            unavailable(format!("no commander at {}: {reason}; start one with `magex commander`", args.connect))
+        let channel = settings.connect(&args.connect).await.map_err(|error| match error {
+            ConnectError::Url(error) => usage(format!("--connect: {error}")),
+            ConnectError::Transport(error) => {
+                let reason = anyhow::Error::new(error);
+                let reason = reason.root_cause();
+                unavailable(format!("no commander at {}: {reason}; start one with `magex commander`", args.connect))
+            }
         })?;
         let mut client = CommanderServiceClient::new(channel);
         let call = client.assign(request);

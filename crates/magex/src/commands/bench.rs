@@ -1,11 +1,15 @@
 //! `magex bench`: the tables of docs/results.md, measured on this machine.
 
 mod assign;
+mod cluster;
+mod fleet;
 mod goals;
 mod runs;
+mod soak;
 mod speed;
 mod tasks;
 mod training;
+mod vitals;
 
 use crate::cli::Global;
 use crate::output::{Output, Table};
@@ -21,6 +25,7 @@ Examples:
   magex bench train --agents 50 --seeds 1,2,3       trains and evaluates; the result table
   magex bench tasks --tasks drones-4                the same for Push Ball and the drones
   magex bench distributed                           services against one process
+  magex bench cluster                               what the learner's wire carries
 
 Timings are medians on one core (unless a table says otherwise) and as noisy as the machine is busy:
 compare ratios taken in one go, not numbers from different days. What is not a time is the same on every
@@ -56,7 +61,14 @@ enum What {
     Tasks(tasks::TasksArgs),
     /// Weights of one team size on other team sizes.
     Generalisation(runs::GeneralisationArgs),
-    /// Env, update, assign, commander, ranking, distributed, train and tasks.
+    /// The learner's wire: throughput, many actors, weights to many subscribers, restart after a kill.
+    Cluster(cluster::ClusterArgs),
+    /// Memory and open files of a training cluster over an hour.
+    Soak(soak::SoakArgs),
+    /// The learner of `bench cluster`: only ingests.
+    #[command(hide = true)]
+    Ingest(cluster::IngestArgs),
+    /// All of these but soak.
     All,
 }
 
@@ -96,10 +108,12 @@ pub(crate) fn run(args: &BenchArgs, global: &Global) -> anyhow::Result<u8> {
     };
     let parts = match &args.what {
         None => quick().to_vec(),
+        Some(What::Ingest(args)) => return cluster::serve_ingest(args),
         Some(What::All) => {
             let long = [
                 What::Ranking(Default::default()),
                 What::Distributed(Default::default()),
+                What::Cluster(Default::default()),
                 What::Train(Default::default()),
                 What::Tasks(Default::default()),
             ];
@@ -134,7 +148,9 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Train(args) => training::train(args),
         What::Tasks(args) => tasks::tasks(args),
         What::Generalisation(args) => runs::generalisation(args),
-        What::All => Err(anyhow::anyhow!("all is not a table")),
+        What::Cluster(args) => cluster::cluster(args),
+        What::Soak(args) => soak::soak(args),
+        What::Ingest(_) | What::All => Err(anyhow::anyhow!("this is not a table")),
     }
 }
 

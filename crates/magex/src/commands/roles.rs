@@ -5,14 +5,17 @@ use magex_actor::cli::ActorArgs;
 use magex_commander::cli::CommanderArgs;
 use magex_learner::cli::LearnerArgs;
 use magex_runtime::exit::{self, Failure};
+use std::ffi::OsString;
 use std::io::Read as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 const LEARNER_HELP: &str = "\
 Examples:
-  magex learner --config run.toml --out runs/mine --listen 0.0.0.0:7000
+  magex learner --config run.toml --out runs/mine
+  magex learner --listen 0.0.0.0:7000 --tls-cert server.pem --tls-key server.key --identities who.toml
   magex learner --out runs/mine --resume
+  magex learner --out runs/mine --resume-or-create --stay     for a restart policy
 
 Options can be set in the environment too; options of the command win. Actors and commander may start
 before or after it.
@@ -25,6 +28,7 @@ const ACTOR_HELP: &str = "\
 Examples:
   magex actor --learner http://10.0.0.1:7000 --commander http://10.0.0.2:7100
   magex actor --threads 4 --stay
+  magex actor --learner https://10.0.0.1:7000 --tls-ca ca.pem --token-file token
 
 An actor that finds no learner waits for one. How many actors there are changes no number of the run.
 
@@ -42,6 +46,17 @@ Ask it with magex assign, or over gRPC (reflection is on); docs/commander.md has
 
 Exit codes: 0 told to stop, 64 wrong usage or weights, 69 the port is in use, 70 a fault of this program,
 73 --data cannot be used, 130 interrupted twice";
+
+/// A service under its own name: what is called `magex-learner` and is this program does what `magex learner` does. So one
+/// program and three links to it are all four.
+pub(crate) fn by_name(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    let mut arguments: Vec<OsString> = arguments.collect();
+    let name = arguments.first().and_then(|name| Path::new(name).file_name()?.to_str()?.strip_prefix("magex-"));
+    if let Some(role) = name.filter(|name| ["learner", "actor", "commander"].contains(name)).map(OsString::from) {
+        arguments.insert(1, role);
+    }
+    arguments
+}
 
 /// Run the learner alone: leases work to actors, trains, broadcasts weights.
 #[derive(Debug, Clone, clap::Args)]
@@ -126,5 +141,24 @@ impl Leash {
         };
         let thread = std::thread::Builder::new().name("magex-leash".into()).spawn(watch);
         thread.map(drop).map_err(|error| Failure::new(exit::INTERNAL, error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_link_is_the_service_that_it_is_named_after() {
+        let called = |line: &str| {
+            let words = by_name(line.split(' ').map(OsString::from));
+            words.iter().map(|word| word.to_string_lossy().into_owned()).collect::<Vec<_>>().join(" ")
+        };
+        assert_eq!(called("/bin/magex-learner --resume"), "/bin/magex-learner learner --resume");
+        assert_eq!(called("magex-actor"), "magex-actor actor");
+        assert_eq!(called("magex-commander --help"), "magex-commander commander --help");
+        for other in ["magex train", "/usr/magex-learner/magex eval", "magex-other x"] {
+            assert_eq!(called(other), other);
+        }
     }
 }

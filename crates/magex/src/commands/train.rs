@@ -13,8 +13,9 @@ use anyhow::Context as _;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::task::TaskName;
+use magex_learner::page::{LivePage, RunInfo};
 use magex_learner::trainer::{Outcome, TrainError, Trainer};
-use magex_runtime::{backoff, exit, shutdown};
+use magex_runtime::{backoff, exit, http, server, shutdown};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -22,6 +23,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::Instant;
+use tokio_util::sync::CancellationToken;
 
 const AFTER_HELP: &str = "\
 Examples:
@@ -30,9 +32,10 @@ Examples:
   magex train my.toml --out runs/mine           a configuration of your own
   magex train --resume --out runs/mine          continue after Ctrl-C or a crash
   magex train --in-process --json               no other processes; result as JSON
+  magex train --http 127.0.0.1:8080             the live page on a port of your choice (off: no page)
 
-The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, curve.svg
-and replay.html. The same configuration and seed give the same weights, in one process or with any number
+The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, curve.svg,
+replay.html and tensorboard/. While the run goes, its live page says how it stands: the address is printed. The same configuration and seed give the same weights, in one process or with any number
 of actors. Ctrl-C finishes the iteration, writes a checkpoint and says how to resume; a second Ctrl-C
 stops at once.
 
@@ -61,6 +64,9 @@ pub(crate) struct TrainArgs {
     /// Training threads (and rollout threads with --in-process) [default: the cores of this machine].
     #[arg(long, value_name = "T", value_parser = settings::threads)]
     pub(crate) threads: Option<usize>,
+    /// Address of the live page, or `off`; port 0 is any free one.
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:0")]
+    pub(crate) http: String,
     /// Print the effective configuration as TOML and do nothing else.
     #[arg(long)]
     pub(crate) print_config: bool,
@@ -74,6 +80,8 @@ pub(crate) struct Job {
     pub(crate) folder: PathBuf,
     pub(crate) resume: bool,
     pub(crate) threads: usize,
+    /// Where the live page is to be, if it is wanted.
+    pub(crate) http: Option<String>,
 }
 
 /// How it ended.
@@ -94,12 +102,16 @@ pub(crate) fn run(args: &TrainArgs, global: &Global) -> anyhow::Result<u8> {
         output.result(&serde_json::to_value(&config)?);
         return Ok(exit::OK);
     }
+    let http = (args.http != "off").then(|| args.http.clone());
+    if let Some(listen) = &http {
+        server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
+    }
     let folder = args.out.clone().unwrap_or_else(|| folder::default_out(&config, Path::exists));
     if !args.resume {
         folder::create(&folder, &config)?;
     }
     let threads = args.threads.unwrap_or_else(settings::cores);
-    let job = Job { config, folder, resume: args.resume, threads };
+    let job = Job { config, folder, resume: args.resume, threads, http };
     let out = job.folder.display().to_string();
     let title = match args.in_process {
         true => format!("one process, {threads} threads"),
@@ -123,7 +135,7 @@ pub(crate) fn run(args: &TrainArgs, global: &Global) -> anyhow::Result<u8> {
             }
             let span = |end: Instant| (end - clock).as_secs_f64();
             let walls = Walls { command_s: span(Instant::now()), training_s: progress.last_iteration().map(span) };
-            finished(&job, args.in_process, walls, output)
+            finished(&job, args.in_process, walls, progress.page_url(), output)
         }
         End::Stopped => Ok(stopped(&job, output)),
     }
@@ -180,6 +192,23 @@ fn in_process(job: &Job, progress: &mut Progress) -> anyhow::Result<End> {
         flag.store(true, Ordering::Relaxed);
         note("finishing the iteration, then writing a checkpoint");
     });
+    let showing = match &job.http {
+        Some(listen) => {
+            Some(runtime.block_on(http::bind(listen)).map_err(|e| coded(exit::UNAVAILABLE, e.to_string()))?)
+        }
+        None => None,
+    };
+    let name = job.folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    let closing = CancellationToken::new();
+    let page = showing.map(|showing| {
+        progress.page(&showing.address().to_string());
+        let info = RunInfo { name, ..RunInfo::default() };
+        let page = Arc::new(LivePage::new(&job.config, info));
+        let _entered = runtime.enter();
+        (page.clone(), showing.serve(page.routes(|| None), closing.clone()))
+    });
+    let (shown, serving) = page.unzip();
+    let watched = shown.clone();
     let (events, received) = mpsc::channel();
     let mut collector = LocalCollector::new(&job.config, job.threads, events, stop);
     let outcome = std::thread::scope(|scope| {
@@ -187,12 +216,23 @@ fn in_process(job: &Job, progress: &mut Progress) -> anyhow::Result<End> {
             scope,
             move || {
                 let mut trainer = trainer(job)?;
+                if let Some(page) = shown {
+                    trainer.show(page);
+                }
                 trainer.run(&mut collector)
             },
         )?;
         received.iter().for_each(|event| progress.event(&event));
         training.join().map_err(|_| coded(exit::INTERNAL, "the training thread panicked; its last words are above"))
     })?;
+    if let Some(page) = watched.filter(|_| outcome.is_ok()) {
+        runtime.block_on(page.farewell());
+    }
+    closing.cancel();
+    if let Some(serving) = serving {
+        // It only logs what goes wrong, and ends soon.
+        let _ = runtime.block_on(serving);
+    }
     match outcome? {
         Outcome::Finished(_) => Ok(End::Finished),
         Outcome::Stopped(_) => Ok(End::Stopped),
@@ -243,7 +283,7 @@ struct Walls {
     training_s: Option<f64>,
 }
 
-fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow::Result<u8> {
+fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, output: Output) -> anyhow::Result<u8> {
     let path = job.folder.join(folder::SUMMARY);
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     let mut value: Value = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
@@ -287,6 +327,7 @@ fn finished(job: &Job, in_process: bool, walls: Walls, output: Output) -> anyhow
         map.insert("target_wall_s".into(), json!(walls.training_s));
         map.insert("out".into(), json!(job.folder));
         map.insert("in_process".into(), json!(in_process));
+        map.insert("page".into(), json!(page));
     }
     output.result(&value);
     Ok(exit::OK)

@@ -26,7 +26,7 @@ const LONG: Duration = Duration::from_secs(20);
 
 /// How to start a service.
 #[derive(Debug, Clone)]
-pub(super) struct Service {
+pub(crate) struct Service {
     name: String,
     arguments: Vec<String>,
     log: PathBuf,
@@ -34,7 +34,7 @@ pub(super) struct Service {
 
 /// A service that runs.
 #[derive(Debug)]
-pub(super) struct Running {
+pub(crate) struct Running {
     name: String,
     child: Child,
     /// Open for as long as the service shall run. Held apart: waiting for a child closes what it still has.
@@ -43,17 +43,19 @@ pub(super) struct Running {
     /// Where the log of this process begins.
     log_start: u64,
     /// Where it listens; empty if it does not.
-    pub(super) address: String,
+    pub(crate) address: String,
+    /// Where it shows its pages, if it does.
+    pub(crate) http: Option<String>,
 }
 
 impl Service {
-    pub(super) fn new(name: &str, arguments: &[&str], logs: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn new(name: &str, arguments: &[&str], logs: &Path) -> anyhow::Result<Self> {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
         Ok(Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")) })
     }
 
     /// Starts it and waits until it is ready.
-    pub(super) async fn start(&self) -> anyhow::Result<Running> {
+    pub(crate) async fn start(&self) -> anyhow::Result<Running> {
         let open = || OpenOptions::new().create(true).append(true).open(&self.log);
         let log = open().with_context(|| self.log.display().to_string())?;
         let log_start = log.metadata().map_or(0, |meta| meta.len());
@@ -74,16 +76,17 @@ impl Service {
         let mut child = command.spawn().with_context(|| format!("starting the {}", self.name))?;
         let (stdout, stdin) = (child.stdout.take(), child.stdin.take());
         let (name, log) = (self.name.clone(), self.log.clone());
-        let mut running = Running { name, child, _stdin: stdin, log, log_start, address: String::new() };
+        let mut running = Running { name, child, _stdin: stdin, log, log_start, address: String::new(), http: None };
         let ready = async {
             let mut lines = BufReader::new(stdout?).lines();
             let line = lines.next_line().await.ok()??;
             let value: serde_json::Value = serde_json::from_str(&line).ok()?;
-            Some(value["address"].as_str().unwrap_or_default().to_owned())
+            let text = |key: &str| value[key].as_str().map(str::to_owned);
+            Some((text("address").unwrap_or_default(), text("http")))
         };
         match tokio::time::timeout(START, ready).await {
-            Ok(Some(address)) => {
-                running.address = address;
+            Ok(Some((address, http))) => {
+                (running.address, running.http) = (address, http);
                 Ok(running)
             }
             Ok(None) => {
@@ -99,12 +102,22 @@ impl Service {
 
 impl Running {
     /// Until it ends.
-    pub(super) async fn wait(&mut self) -> std::io::Result<ExitStatus> {
+    pub(crate) async fn wait(&mut self) -> std::io::Result<ExitStatus> {
         self.child.wait().await
     }
 
+    /// Its process; 0 once it has ended.
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id().unwrap_or_default()
+    }
+
+    /// SIGKILL.
+    pub(crate) async fn kill(&mut self) -> std::io::Result<()> {
+        self.child.kill().await
+    }
+
     /// Asks it to stop.
-    pub(super) fn terminate(&self) {
+    pub(crate) fn terminate(&self) {
         if let Some(pid) = self.child.id().and_then(|id| Pid::from_raw(id as i32)) {
             // It may be gone already.
             let _ = kill_process(pid, Signal::TERM);
@@ -112,7 +125,7 @@ impl Running {
     }
 
     /// Asks it to stop, waits, and kills it if it does not.
-    pub(super) async fn stop(&mut self) {
+    pub(crate) async fn stop(&mut self) {
         self.terminate();
         if tokio::time::timeout(GRACE, self.wait()).await.is_err() {
             tracing::warn!(service = self.name, "does not stop; killing it");
@@ -121,7 +134,7 @@ impl Running {
     }
 
     /// Why it ended: the signal, or the last line of its log.
-    pub(super) fn last_words(&self, status: ExitStatus) -> String {
+    pub(crate) fn last_words(&self, status: ExitStatus) -> String {
         if let Some(signal) = status.signal() {
             return format!("killed by signal {signal}");
         }
@@ -134,7 +147,7 @@ impl Running {
 }
 
 /// Keeps a helper running until `stop`, or until it has done its work.
-pub(super) async fn keep(service: Service, first: Running, stop: CancellationToken) -> anyhow::Result<()> {
+pub(crate) async fn keep(service: Service, first: Running, stop: CancellationToken) -> anyhow::Result<()> {
     let mut running = first;
     let (mut lives, mut backoff) = (LIVES, Backoff::default());
     loop {

@@ -1,20 +1,28 @@
 //! The pairwise scorer: a small network that looks at one (agent, goal) pair at a time, so it serves any team size and
 //! does not care about the order of agents and goals.
+//!
+//! Entropic transport prices say how much worse than a global compromise each pair is; the network refines the pairs that
+//! are among the best of their row, and leaves the others as they are.
 
-use super::{CommanderError, Instance, Team, constant, duals};
+use super::instance::Turns;
+use super::{CommanderError, Instance, Team, constant};
 use crate::executor::{Layer, RELU_GAIN};
 use crate::matmul::Activation;
 use crate::params::{ParamError, Source, Start};
-use candle_core::{Result as CandleResult, Tensor};
+use candle_core::{Device, Result as CandleResult, Tensor};
+use magex_assign::duals::{Schedule, sinkhorn_duals};
 
 /// Features of a pair.
-const FEATURES: usize = 6;
+const FEATURES: usize = 10;
 
-/// Reduced costs are magnified by this before they become scores: a difference of 3 % of the mean distance is then worth
-/// one unit of log-probability at the start of learning.
-const MAGNIFY: f32 = 30.0;
+/// Pairs of each row that the network looks at: those with the least reduced cost.
+const LOOKED_AT: usize = 4;
 
-/// score_ij = −sharpness · 30 · reduced_ij + MLP(features_ij).
+/// Reduced costs become scores in units of the typical distance between neighbours, mean distance / √rows: a quarter of it is
+/// worth one unit of log-probability at the start of learning.
+const MAGNIFY: f32 = 4.0;
+
+/// score_ij = −sharpness · reduced_ij + MLP(features_ij), the second for the pairs that the network looks at.
 pub struct PairwiseNet {
     sharpness: Tensor,
     first: Layer,
@@ -23,7 +31,7 @@ pub struct PairwiseNet {
 }
 
 impl PairwiseNet {
-    /// 6 → hidden → hidden → 1.
+    /// 10 → hidden → hidden → 1.
     pub fn build(hidden: usize, source: &mut Source<'_>) -> Result<Self, ParamError> {
         Ok(Self {
             sharpness: source.get("sharpness", &[1], Start::Constant(1.0))?,
@@ -33,31 +41,85 @@ impl PairwiseNet {
         })
     }
 
-    /// `[P]` scores from features [P, 6].
-    pub(super) fn forward(&self, features: Vec<f32>) -> CandleResult<Tensor> {
+    /// Flat scores of several instances.
+    pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
+        let cells = instances.iter().map(Instance::cells).sum();
+        let mut reduced = Vec::with_capacity(cells);
+        let (mut features, mut places) = (Vec::new(), Vec::new());
+        for instance in instances {
+            places.extend(instance.looked_at.iter().map(|place| reduced.len() as u32 + place));
+            reduced.extend_from_slice(&instance.reduced);
+            features.extend_from_slice(&instance.features);
+        }
         let x = constant(features, FEATURES)?;
-        let reduced = x.narrow(1, 0, 1)?.flatten_all()?;
-        let learned = self.out.forward(&self.second.forward(&self.first.forward_constant(&x)?)?)?.flatten_all()?;
-        learned - reduced.broadcast_mul(&self.sharpness)?
+        let refined = self.out.forward(&self.second.forward(&self.first.forward_constant(&x)?)?)?.flatten_all()?;
+        let scores = Tensor::from_vec(reduced, cells, &Device::Cpu)?.broadcast_mul(&self.sharpness.neg()?)?;
+        let places = Tensor::from_vec(places, refined.elem_count(), &Device::Cpu)?;
+        scores.index_add(&places, &refined, 0)
     }
 }
 
-/// The side with fewer members picks; whoever has most to lose picks first (largest difference between the best and the
-/// second-best reduced cost, ties by index).
+/// The side with fewer members picks.
 pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
-    let (n, g, d) = (team.agent_count(), team.goal_count(), team.dims);
+    let (n, g) = (team.agent_count(), team.goal_count());
     if n == 0 || g == 0 {
         return Err(CommanderError::Instance("agents and goals must not be empty".to_owned()));
     }
     let swapped = n > g;
-    let (pickers, options) = if swapped { (team.goals, team.agents) } else { (team.agents, team.goals) };
     let (rows, columns) = (n.min(g), n.max(g));
-    let mut cost = Vec::with_capacity(rows * columns);
-    for p in pickers.chunks_exact(d) {
-        for o in options.chunks_exact(d) {
-            let square = p.iter().zip(o).fold(0.0f32, |s, (a, b)| (a - b).mul_add(a - b, s));
-            cost.push(square.sqrt());
+    let cost = distances(team, swapped)?;
+    // Options that nobody takes must have a price, too: pickers that do not exist take them for nothing. Without them
+    // everybody would have to spread over all options.
+    let mut filled = cost.clone();
+    filled.resize(columns * columns, 0.0);
+    let duals = sinkhorn_duals(&filled, columns, columns, &Schedule::for_pairs(filled.len()))?;
+    let mean = (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12) as f32;
+    let spacing = mean / (rows as f32).sqrt();
+    let unit = MAGNIFY / spacing;
+    let mut reduced = cost;
+    let mut row_base = Vec::with_capacity(rows);
+    for (row, u) in reduced.chunks_exact_mut(columns).zip(&duals.rows) {
+        for (cost, v) in row.iter_mut().zip(&duals.cols) {
+            *cost = (*cost - u - v) * unit;
         }
+        let least = row.iter().fold(f32::MAX, |least, &value| if value < least { value } else { least });
+        row.iter_mut().for_each(|value| *value = (*value - least).min(LARGEST));
+        row_base.push(least);
+    }
+    let (features, looked_at) = features(&reduced, &row_base, columns);
+    let column_of = (0..columns as u32).collect();
+    Ok(Instance {
+        features,
+        reduced,
+        looked_at,
+        rows,
+        columns,
+        turns: Turns::MostToLose,
+        column_of,
+        swapped,
+        agents: n,
+    })
+}
+
+/// Reduced costs are kept below this: beyond it a pair is hopeless anyway.
+const LARGEST: f32 = 1e4;
+
+/// Distances [rows, columns] between those who pick and what they pick.
+fn distances(team: &Team<'_>, swapped: bool) -> Result<Vec<f32>, CommanderError> {
+    let d = team.dims;
+    let (pickers, options) = if swapped { (team.goals, team.agents) } else { (team.agents, team.goals) };
+    let columns = options.len() / d;
+    let mut cost = vec![0.0f32; pickers.len() / d * columns];
+    // One coordinate of all options side by side, so that the loop over them is one of vectors.
+    let coordinate = |k: usize| options.iter().skip(k).step_by(d).copied().collect::<Vec<f32>>();
+    let options: Vec<Vec<f32>> = (0..d).map(coordinate).collect();
+    for (row, picker) in cost.chunks_exact_mut(columns).zip(pickers.chunks_exact(d)) {
+        for (options, &own) in options.iter().zip(picker) {
+            for (square, &other) in row.iter_mut().zip(options) {
+                *square = (own - other).mul_add(own - other, *square);
+            }
+        }
+        row.iter_mut().for_each(|square| *square = square.sqrt());
     }
     if let Some(place) = cost.iter().position(|c| !c.is_finite()) {
         return Err(CommanderError::Instance(format!(
@@ -66,48 +128,74 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
             if swapped { place / columns } else { place % columns }
         )));
     }
-    let (u, v) = duals(&cost, rows, columns)?;
-    let mean = (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12) as f32;
-    let scale = 1.0 / mean;
-    let mut row_min = vec![f32::INFINITY; rows];
-    let mut column_min = vec![f32::INFINITY; columns];
-    // Best and second-best reduced cost of each row.
-    let mut regret = vec![(f32::INFINITY, f32::INFINITY); rows];
-    for i in 0..rows {
-        for j in 0..columns {
-            let c = cost[i * columns + j];
-            row_min[i] = row_min[i].min(c);
-            column_min[j] = column_min[j].min(c);
-            let r = (c - u[i] - v[j]) * scale;
-            let (best, second) = &mut regret[i];
-            if r < *best {
-                *second = *best;
-                *best = r;
-            } else {
-                *second = second.min(r);
-            }
+    Ok(cost)
+}
+
+/// Features of the pairs that the network looks at, and where those are. `reduced` [rows, columns] is relative to the best of
+/// each row, which is `row_base`.
+fn features(reduced: &[f32], row_base: &[f32], columns: usize) -> (Vec<f32>, Vec<u32>) {
+    let rows = row_base.len();
+    // Of every column: the best and second-best among the rows, and how many rows like it best.
+    let mut column_best = vec![f32::MAX; columns];
+    let mut column_second = vec![f32::MAX; columns];
+    let mut wanted = vec![0.0f32; columns];
+    for (row, base) in reduced.chunks_exact(columns).zip(row_base) {
+        for ((best, second), value) in column_best.iter_mut().zip(&mut column_second).zip(row) {
+            let value = value + base;
+            let larger = if value < *best { *best } else { value };
+            *second = if larger < *second { larger } else { *second };
+            *best = if value < *best { value } else { *best };
+        }
+        for (wanted, &value) in wanted.iter_mut().zip(row) {
+            *wanted += if value == 0.0 { 1.0 } else { 0.0 };
         }
     }
-    let mut features = Vec::with_capacity(rows * columns * FEATURES);
-    for i in 0..rows {
-        for j in 0..columns {
-            let c = cost[i * columns + j];
-            let reduced = ((c - u[i] - v[j]) * scale - regret[i].0).clamp(0.0, 10.0);
+    let size = libm::logf(rows as f32) / 6.0;
+    let crowd = libm::logf(columns as f32 / rows as f32);
+    let count = LOOKED_AT.min(columns);
+    let mut features = Vec::with_capacity(rows * count * FEATURES);
+    let mut looked_at = Vec::with_capacity(rows * count);
+    for (i, (row, base)) in reduced.chunks_exact(columns).zip(row_base).enumerate() {
+        let best = least(row);
+        let regret = best[1].0.min(LARGEST);
+        for (rank, &(value, j)) in best[..count].iter().enumerate() {
+            let over_column = value + base - column_best[j];
+            let column_regret = (column_second[j] - column_best[j]).min(LARGEST);
             features.extend([
-                MAGNIFY * reduced,
-                (MAGNIFY * reduced).min(1.0),
-                reduced.min(1.0),
-                (c * scale).min(4.0),
-                ((c - row_min[i]) * scale).min(4.0),
-                ((c - column_min[j]) * scale).min(4.0),
+                squash(value),
+                squash(0.1 * value),
+                squash(over_column),
+                squash(0.1 * over_column),
+                squash(regret),
+                squash(column_regret),
+                (wanted[j] - 1.0).clamp(-1.0, 3.0),
+                rank as f32 / LOOKED_AT as f32,
+                size,
+                crowd.min(2.0),
             ]);
+            looked_at.push((i * columns + j) as u32);
         }
     }
-    let mut turns: Vec<(u32, u32)> = (0..rows as u32).map(|i| (i, i)).collect();
-    turns.sort_by(|a, b| {
-        let gap = |i: u32| regret[i as usize].1 - regret[i as usize].0;
-        gap(b.0).total_cmp(&gap(a.0)).then(a.0.cmp(&b.0))
-    });
-    let column_of = (0..columns as u32).collect();
-    Ok(Instance { features, rows, columns, turns, column_of, swapped, agents: n })
+    (features, looked_at)
+}
+
+/// [0, ∞) → [0, 1), steepest at 0.
+fn squash(x: f32) -> f32 {
+    x / (1.0 + x)
+}
+
+/// The smallest of a row with their columns, ascending, ties by column; f32::MAX where the row has no more.
+fn least(row: &[f32]) -> [(f32, usize); LOOKED_AT] {
+    let mut found = [(f32::MAX, 0); LOOKED_AT];
+    for (column, &value) in row.iter().enumerate() {
+        if value < found[LOOKED_AT - 1].0 {
+            let mut place = LOOKED_AT - 1;
+            while place > 0 && value < found[place - 1].0 {
+                found[place] = found[place - 1];
+                place -= 1;
+            }
+            found[place] = (value, column);
+        }
+    }
+    found
 }

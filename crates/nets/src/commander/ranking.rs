@@ -4,6 +4,7 @@
 //! Rank r means "agent r", so the order of the indices decides whether there is anything to learn: with shuffled indices
 //! it learns nothing. Agents and goals are therefore put into a canonical spatial order first.
 
+use super::instance::Turns;
 use super::{CommanderError, Instance, Team, constant};
 use crate::executor::Layer;
 use crate::matmul::Activation;
@@ -45,8 +46,9 @@ impl RankingNet {
         })
     }
 
-    /// [B·N] scores from features [B, 2·D·N].
-    pub(super) fn forward(&self, features: Vec<f32>) -> CandleResult<Tensor> {
+    /// [B·N] scores of B instances.
+    pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
+        let features = instances.iter().flat_map(|instance| instance.features.iter().copied()).collect();
         let x = constant(features, 2 * self.dims * self.agents)?;
         let hidden = self.layers[1].forward(&self.layers[0].forward_constant(&x)?)?;
         let raw = self.layers[2].forward(&hidden)?;
@@ -80,8 +82,19 @@ impl RankingNet {
         let mut features = Vec::with_capacity(2 * d * n);
         agents.iter().for_each(|&i| features.extend((0..d).map(|k| place(team.agents, i as usize, k))));
         goals.iter().for_each(|&i| features.extend((0..d).map(|k| place(team.goals, i as usize, k))));
-        let turns = agents.iter().map(|&agent| (0, agent)).collect();
-        Ok(Instance { features, rows: 1, columns: n, turns, column_of: goals, swapped: false, agents: n })
+        let (reduced, looked_at) = (Vec::new(), Vec::new());
+        let turns = Turns::Given(agents);
+        Ok(Instance {
+            features,
+            reduced,
+            looked_at,
+            rows: 1,
+            columns: n,
+            turns,
+            column_of: goals,
+            swapped: false,
+            agents: n,
+        })
     }
 }
 

@@ -1,6 +1,8 @@
 use super::{slice, with_numbers};
+use crate::simd::{LANES, load, store, sum};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use std::sync::Arc;
+use wide::f32x16;
 
 /// One decision of an assignment: which row of the instance's score matrix chose which column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,21 +35,65 @@ struct PickLogProbs {
     tables: Arc<Vec<PickTable>>,
 }
 
-/// Log-softmax over the free columns of a row: fills `log_probs` (free columns only) and returns the entropy. The maximum
-/// is taken over the free columns at every pick: with the row's maximum the sum could underflow late in a ranking.
-pub(crate) fn masked_log_softmax(row: &[f32], free: &[bool], log_probs: &mut [f32]) -> f32 {
-    let open = || row.iter().zip(free).filter(|(_, free)| **free).map(|(x, _)| *x);
-    let max = open().fold(f32::NEG_INFINITY, f32::max);
-    let sum: f32 = open().map(|x| libm::expf(x - max)).sum();
-    let log_sum = libm::logf(sum);
-    let mut entropy = 0.0;
-    for ((out, &x), &free) in log_probs.iter_mut().zip(row).zip(free) {
-        if free {
-            *out = (x - max) - log_sum;
-            entropy -= libm::expf(*out) * *out;
-        }
+/// Lowest exponent: e^−80 adds nothing to a sum of at least 1, and is a normal number.
+const FLOOR: f32 = -80.0;
+
+/// Which columns can still be taken: 0 for those, −∞ for the others, to be added to scores.
+pub(crate) type Open = [f32];
+
+/// Log-softmax over the free columns of a row. The maximum is taken over the free columns at every pick: with the row's
+/// maximum the sum could underflow late in a ranking.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct MaskedSoftmax {
+    /// Largest free score.
+    pub(crate) max: f32,
+    log_sum: f32,
+}
+
+impl MaskedSoftmax {
+    pub(crate) fn of(row: &[f32], open: &Open) -> Self {
+        let lowest = f32x16::splat(f32::NEG_INFINITY);
+        let highest = vectors(row, open).fold(lowest, |max, (x, _)| max.fast_max(x)).to_array();
+        let max = highest.into_iter().fold(f32::NEG_INFINITY, |a, b| if b > a { b } else { a });
+        let (shift, floor) = (f32x16::splat(max), f32x16::splat(FLOOR));
+        let total = vectors(row, open).fold(f32x16::ZERO, |total, (x, _)| total + (x - shift).fast_max(floor).exp());
+        Self { max, log_sum: libm::logf(sum(total)) }
     }
-    entropy
+
+    /// Of a free column with this score.
+    pub(crate) fn log_prob(&self, score: f32) -> f32 {
+        (score - self.max) - self.log_sum
+    }
+
+    /// Fills the probabilities and log-probabilities (meaningless where a column is taken) and returns the entropy.
+    fn fill(&self, row: &[f32], open: &Open, probs: &mut [f32], log_probs: &mut [f32]) -> f32 {
+        let (shift, log_sum) = (f32x16::splat(self.max), f32x16::splat(self.log_sum));
+        let mut entropy = f32x16::ZERO;
+        let outs = probs.chunks_mut(LANES).zip(log_probs.chunks_mut(LANES));
+        for ((x, is_open), (probs, log_probs)) in vectors(row, open).zip(outs) {
+            let log_prob = ((x - shift) - log_sum).fast_max(f32x16::splat(FLOOR));
+            let prob = log_prob.exp() * is_open;
+            entropy -= prob * log_prob;
+            store(prob, probs);
+            store(log_prob, log_probs);
+        }
+        sum(entropy)
+    }
+}
+
+/// A row cut into vectors: scores, −∞ where a column is taken or there is none, and 1 or 0 for the same.
+fn vectors<'a>(row: &'a [f32], open: &'a Open) -> impl Iterator<Item = (f32x16, f32x16)> + 'a {
+    row.chunks(LANES).zip(open.chunks(LANES)).map(|(row, open)| {
+        let open = match open.first_chunk::<LANES>() {
+            Some(open) => f32x16::new(*open),
+            None => {
+                let mut lanes = [f32::NEG_INFINITY; LANES];
+                lanes[..open.len()].copy_from_slice(open);
+                f32x16::new(lanes)
+            }
+        };
+        (load(row) + open, (open + f32x16::ONE).fast_max(f32x16::ZERO))
+    })
 }
 
 impl CustomOp1 for PickLogProbs {
@@ -61,17 +107,19 @@ impl CustomOp1 for PickLogProbs {
         let mut out = vec![0.0; 2 * count];
         let mut at = 0;
         for table in self.tables.iter() {
-            let mut free = vec![true; table.columns];
-            let mut log_probs = vec![0.0; table.columns];
+            let mut open = vec![0.0; table.columns];
+            let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
             for pick in &table.picks {
                 let start = table.start + pick.row as usize * table.columns;
                 let column = pick.column as usize;
-                if start + table.columns > scores.len() || !free.get(column).copied().unwrap_or(false) {
+                if start + table.columns > scores.len() || open.get(column).is_none_or(|open| *open < 0.0) {
                     bail!("picks: row {} column {column} does not exist or is taken", pick.row);
                 }
-                out[count + at] = masked_log_softmax(&scores[start..start + table.columns], &free, &mut log_probs);
-                out[at] = log_probs[column];
-                free[column] = false;
+                let row = &scores[start..start + table.columns];
+                let softmax = MaskedSoftmax::of(row, &open);
+                out[at] = softmax.log_prob(row[column]);
+                out[count + at] = softmax.fill(row, &open, &mut probs, &mut log_probs);
+                open[column] = f32::NEG_INFINITY;
                 at += 1;
             }
         }
@@ -85,21 +133,19 @@ impl CustomOp1 for PickLogProbs {
             let mut gradient = vec![0.0; scores.len()];
             let mut at = 0;
             for table in self.tables.iter() {
-                let mut free = vec![true; table.columns];
-                let mut log_probs = vec![0.0; table.columns];
+                let mut open = vec![0.0; table.columns];
+                let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
                 for pick in &table.picks {
                     let start = table.start + pick.row as usize * table.columns;
                     let row = start..start + table.columns;
-                    let entropy = masked_log_softmax(&scores[row.clone()], &free, &mut log_probs);
+                    let scores = &scores[row.clone()];
+                    let entropy = MaskedSoftmax::of(scores, &open).fill(scores, &open, &mut probs, &mut log_probs);
                     let (d_log_prob, d_entropy) = (upstream[at], upstream[count + at]);
-                    for (j, g) in gradient[row].iter_mut().enumerate() {
-                        if free[j] {
-                            let p = libm::expf(log_probs[j]);
-                            let chosen = if j == pick.column as usize { 1.0 } else { 0.0 };
-                            *g += d_log_prob * (chosen - p) - d_entropy * p * (log_probs[j] + entropy);
-                        }
+                    for ((g, &p), &log_prob) in gradient[row].iter_mut().zip(&probs).zip(&log_probs) {
+                        *g -= p * (d_log_prob + d_entropy * (log_prob + entropy));
                     }
-                    free[pick.column as usize] = false;
+                    gradient[start + pick.column as usize] += d_log_prob;
+                    open[pick.column as usize] = f32::NEG_INFINITY;
                     at += 1;
                 }
             }

@@ -79,8 +79,7 @@ pub(super) fn assign(args: &AssignArgs) -> anyhow::Result<Report> {
     std::fs::create_dir_all(&folder)?;
     std::fs::write(folder.join(folder::WEIGHTS), &weights)?;
     std::fs::write(folder.join(folder::CONFIG), config.to_toml()?)?;
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    runtime.block_on(service_rows(&mut report, args, &folder))?;
+    service_rows(&mut report, args, &folder)?;
     Ok(report)
 }
 
@@ -192,23 +191,27 @@ fn team(n: usize, index: u32, scheduler: v1::SchedulerKind) -> v1::AssignRequest
     v1::AssignRequest { agents: points(agents), goals: points(goals), scheduler, ..Default::default() }
 }
 
-async fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow::Result<()> {
+fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow::Result<()> {
+    // One client waits for its answer and does nothing else: one thread, as in a program that asks. Many share two.
+    let one = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let many = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let service = ServiceProcess::start(Some(folder)).context("the commander")?;
     for (kind, name, must, aim) in [
         (v1::SchedulerKind::Exact, "EXACT_TOTAL", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
         (v1::SchedulerKind::Learned, "LEARNED", ["2 / 8 ms", "800/s"], ["0.6 / 2 ms", "4,000/s"]),
     ] {
         let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, kind)).collect();
-        let [p50, p99, inside] = one_client(&service.url, &teams, args.calls, kind).await?;
+        let [p50, p99, inside] = one.block_on(one_client(&service.url, &teams, args.calls, kind))?;
         let what = format!("Assign {name}, {TEAM} × {TEAM}, one client: p50 / p99");
         let value = json!({ "p50_ms": p50, "p99_ms": p99, "service_p50_ms": inside });
         row(report, &what, format!("{p50:.3} / {p99:.3} ms (inside {inside:.3})"), must[0], aim[0], value);
-        let rate = saturate(&service.url, &teams, args.seconds, kind).await?;
+        let rate = many.block_on(saturate(&service.url, &teams, args.seconds, kind))?;
         let what = format!("Assign {name}, {TEAM} × {TEAM}, at saturation");
         row(report, &what, format!("{}/s", thousands(rate)), must[1], aim[1], json!({ "calls_per_s": rate }));
     }
     let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, v1::SchedulerKind::Exact)).collect();
-    let Flood { answered, exhausted, wrong, health_p99, memory } = flood(&service, &teams, args.flood).await?;
+    let Flood { answered, exhausted, wrong, health_p99, memory } =
+        many.block_on(flood(&service, &teams, args.flood))?;
     let [begin, middle, end] = memory;
     let text = format!(
         "{} answers, {} RESOURCE_EXHAUSTED, {} other errors; {begin:.0} → {middle:.0} → {end:.0} MiB; health p99 {health_p99:.1} ms",
@@ -226,7 +229,7 @@ async fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> 
     for (kind, name) in
         [(v1::SchedulerKind::Exact, "EXACT_TOTAL"), (v1::SchedulerKind::ExactMakespan, "EXACT_MAKESPAN")]
     {
-        let [seconds, ..] = one_client(&service.url, &[team(5000, 0, kind)], 1, kind).await?;
+        let [seconds, ..] = one.block_on(one_client(&service.url, &[team(5000, 0, kind)], 1, kind))?;
         let (seconds, peak) = (seconds / 1e3, service.peak_mib());
         let text = format!("{seconds:.1} s, {peak:.0} MiB");
         let value = json!({ "seconds": seconds, "peak_mib": peak });

@@ -1,5 +1,6 @@
 //! A commander as a process of its own.
 
+use super::super::vitals::memory_mib;
 use anyhow::{Context as _, anyhow};
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -33,18 +34,12 @@ impl ServiceProcess {
 
     /// Memory now, MiB; 0 where the system does not tell.
     pub(super) fn mib(&self) -> f64 {
-        self.status("VmRSS:")
+        memory_mib(self.child.id(), "VmRSS:")
     }
 
     /// Most memory so far, MiB; 0 where the system does not tell.
     pub(super) fn peak_mib(&self) -> f64 {
-        self.status("VmHWM:")
-    }
-
-    fn status(&self, key: &str) -> f64 {
-        let text = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap_or_default();
-        let line = text.lines().find_map(|line| line.strip_prefix(key)).unwrap_or_default();
-        line.split_whitespace().next().and_then(|kib| kib.parse::<f64>().ok()).unwrap_or_default() / 1024.0
+        memory_mib(self.child.id(), "VmHWM:")
     }
 }
 

@@ -1,16 +1,16 @@
-//! Who is calling, and what for: bearer tokens and client certificates with roles.
+//! Who is calling, and what for: bearer tokens and client certificates with roles. The same for every service.
 //!
 //! The file of identities holds no secrets, only SHA-256 of tokens and certificates:
 //!
 //! ```toml
 //! [[identity]]
 //! name = "fleet-a"          # owner of its missions, and what limits count
-//! role = "client"           # client, actor or admin
+//! role = "client"           # client, actor, commander or admin
 //! token_sha256 = "…"        # or certificate_sha256 = "…" (of the DER form)
 //! ```
 
-use magex_proto::weights::sha256_hex;
 use serde::Deserialize;
+use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -20,19 +20,23 @@ use tonic::{Request, Status};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
-    /// Assignments, and missions of its own.
+    /// Assignments and missions of its own; how a run stands.
     Client,
-    /// The goals of training episodes.
+    /// Rollouts: leases, weights, the goals of training episodes.
     Actor,
+    /// The weights of a run.
+    Commander,
     /// Everything, everybody's missions included.
     Admin,
 }
 
 /// Who calls.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Caller {
-    pub(crate) name: Arc<str>,
-    pub(crate) role: Role,
+pub struct Caller {
+    /// Name of the identity: owner of its missions, and what limits count.
+    pub name: Arc<str>,
+    /// What it may do.
+    pub role: Role,
 }
 
 /// A file of identities that cannot be used.
@@ -48,6 +52,8 @@ pub struct AccessError {
 pub struct Access {
     /// By SHA-256, lower-case hex. `None`: everybody is let in, as far as TLS lets them.
     known: Option<HashMap<String, Caller>>,
+    /// Somebody is known by a certificate.
+    certificates: bool,
 }
 
 #[derive(Deserialize)]
@@ -82,12 +88,13 @@ impl Access {
         if file.identity.is_empty() {
             return Err("no [[identity]]: nobody could call".to_owned());
         }
-        let mut known = HashMap::new();
+        let (mut known, mut certificates) = (HashMap::new(), false);
         for (k, identity) in file.identity.into_iter().enumerate() {
             let place = format!("identity[{k}]");
             if identity.name.is_empty() {
                 return Err(format!("{place}.name: empty"));
             }
+            certificates |= identity.certificate_sha256.is_some();
             let hash = match (identity.token_sha256, identity.certificate_sha256) {
                 (Some(hash), None) | (None, Some(hash)) => hash.to_ascii_lowercase().replace(':', ""),
                 _ => return Err(format!("{place}: give either token_sha256 or certificate_sha256")),
@@ -100,7 +107,7 @@ impl Access {
                 return Err(format!("{place}: the same SHA-256 occurs before"));
             }
         }
-        Ok(Self { known: Some(known) })
+        Ok(Self { known: Some(known), certificates })
     }
 
     /// Callers must show who they are.
@@ -108,8 +115,16 @@ impl Access {
         self.known.is_some()
     }
 
+    /// Somebody is known by a certificate: callers have to be asked for theirs.
+    pub fn needs_certificates(&self) -> bool {
+        self.certificates
+    }
+
     /// Who makes this call.
-    pub(crate) fn identify<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
+    ///
+    /// # Errors
+    /// UNAUTHENTICATED: nobody who is known here.
+    pub fn identify<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
         let certificate = request.peer_certs().and_then(|chain| chain.first().map(|leaf| sha256_hex(leaf.as_ref())));
         let Some(known) = &self.known else {
             let name = match (&certificate, request.remote_addr()) {
@@ -134,8 +149,11 @@ impl Access {
     }
 }
 
-/// The caller of a request that came through the door, if it may do this.
-pub(crate) fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
+/// The caller of a request that came through the door, if it may do this. Admins may do everything.
+///
+/// # Errors
+/// PERMISSION_DENIED: it has another role.
+pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
     let Some(caller) = request.extensions().get::<Caller>() else {
         return Err(Status::internal("a call came in without its caller"));
     };
@@ -144,6 +162,11 @@ pub(crate) fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller
     }
     let role = format!("{:?}", caller.role).to_lowercase();
     Err(Status::permission_denied(format!("'{}' has the role {role}, which may not do this", caller.name)))
+}
+
+/// SHA-256 as lower-case hex.
+fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]
@@ -175,7 +198,11 @@ mod tests {
         let mut request = Request::new(());
         request.extensions_mut().insert(Caller { name: "a".into(), role: Role::Actor });
         assert!(caller(&request, &[Role::Actor]).is_ok());
-        assert_eq!(caller(&request, &[Role::Client]).unwrap_err().code(), tonic::Code::PermissionDenied);
+        let refused = caller(&request, &[Role::Client, Role::Commander]).unwrap_err();
+        assert!(
+            refused.code() == tonic::Code::PermissionDenied && refused.message().contains("role actor"),
+            "{refused}"
+        );
         assert_eq!(caller(&Request::new(()), &[Role::Client]).unwrap_err().code(), tonic::Code::Internal);
     }
 

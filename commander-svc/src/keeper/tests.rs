@@ -1,0 +1,117 @@
+use super::*;
+use crate::gauges::CommanderGauges;
+use crate::store::Store;
+use magex_dispatch::disk::DiskError;
+use magex_dispatch::missions::Bounds;
+use magex_runtime::metrics::Metrics;
+use std::future::Future;
+use std::task::{Context, Waker};
+use tonic::Code;
+
+fn keeper() -> Arc<Keeper> {
+    let gauges = Arc::new(CommanderGauges::new(&Metrics::new()));
+    let answering = Answering::new(Arc::new(Store::new()), gauges);
+    Keeper::new(Missions::open(None, Bounds::default()).unwrap(), answering)
+}
+
+fn client(name: &str) -> Caller {
+    Caller { name: name.into(), role: Role::Client }
+}
+
+fn members(side: &str, count: usize) -> Vec<v1::Member> {
+    // Far from regular: the solver has something to do.
+    let position = |k: usize| vec![(k * 7919 % 1009) as f32, (k * k % 997) as f32];
+    (0..count).map(|k| v1::Member { id: format!("{side}{k}"), position: position(k), state: 0 }).collect()
+}
+
+fn request(id: &str, agents: usize, goals: usize) -> v1::CreateMissionRequest {
+    let (agents, goals) = (members("a", agents), members("g", goals));
+    v1::CreateMissionRequest { mission_id: id.into(), agents, goals, ..Default::default() }
+}
+
+async fn all_processors(keeper: &Keeper) -> Vec<crate::answering::Places> {
+    let mut taken = Vec::new();
+    while keeper.answering.free_processors() > 0 {
+        taken.push(keeper.answering.places(1, PATIENCE).await.unwrap());
+    }
+    taken
+}
+
+#[tokio::test]
+async fn the_smallest_mission_waits_for_a_processor_like_everybody() {
+    let keeper = keeper();
+    let (me, tiny) = (client("me"), request("m", 1, 1));
+    keeper.create(me.clone(), tiny.clone()).await.unwrap();
+    let taken = all_processors(&keeper).await;
+    let update = v1::UpdateMissionRequest { mission_id: "m".into(), ..Default::default() };
+    let (created, updated) = tokio::join!(
+        keeper.create(me.clone(), v1::CreateMissionRequest { mission_id: "n".into(), ..tiny }),
+        keeper.update(me.clone(), update.clone())
+    );
+    assert_eq!(
+        (created.unwrap_err().code(), updated.unwrap_err().code()),
+        (Code::ResourceExhausted, Code::ResourceExhausted)
+    );
+    drop(taken);
+    assert_eq!(keeper.update(me, update).await.unwrap().revision, 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
+    let keeper = keeper();
+    keeper.create(client("me"), request("old", 1, 1)).await.unwrap();
+    let processors = keeper.answering.free_processors();
+    let large = request("new", 1000, 1000);
+    let update = v1::UpdateMissionRequest {
+        mission_id: "old".into(),
+        agents: large.agents.clone(),
+        goals: large.goals.clone(),
+        ..Default::default()
+    };
+    let calls: [std::pin::Pin<Box<dyn Future<Output = _> + Send>>; 2] =
+        [Box::pin(keeper.create(client("me"), large)), Box::pin(keeper.update(client("me"), update))];
+    for mut call in calls {
+        // The work is on its thread; then the caller hangs up, or its deadline is over.
+        assert!(call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending());
+        drop(call);
+        while keeper.answering.free_processors() < processors {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        assert_eq!(keeper.count(), 1);
+        assert_eq!(keeper.get(&client("me"), "old").unwrap().revision, 1);
+    }
+}
+
+#[tokio::test]
+async fn strangers_cannot_tell_a_mission_of_somebody_else_from_none() {
+    let keeper = keeper();
+    keeper.create(client("me"), request("mine", 1, 1)).await.unwrap();
+    let you = client("you");
+    // Also while no processor is free.
+    let _taken = all_processors(&keeper).await;
+    let said = |status: Status, id: &str| (status.code(), status.message().replace(id, "ID"));
+    let update = |id: &str| v1::UpdateMissionRequest { mission_id: id.into(), ..Default::default() };
+    let none = said(keeper.get(&you, "none").unwrap_err(), "none");
+    assert_eq!(none.0, Code::NotFound);
+    for id in ["mine", "none"] {
+        assert_eq!(said(keeper.get(&you, id).unwrap_err(), id), none);
+        assert_eq!(said(keeper.delete(you.clone(), id.into()).await.unwrap_err(), id), none);
+        assert_eq!(said(keeper.update(you.clone(), update(id)).await.unwrap_err(), id), none);
+    }
+    keeper.delete(client("me"), "mine".into()).await.unwrap();
+    assert_eq!(keeper.count(), 0);
+}
+
+#[test]
+fn a_disk_that_takes_nothing_is_a_reason_to_come_again() {
+    let status = kept(KeepError::Disk(DiskError::Resting));
+    assert_eq!(status.code(), Code::Unavailable);
+    assert!(status::retry_delay(&status).is_some() && status.message().contains("make room"), "{status}");
+}
+
+#[test]
+fn the_learned_scheduler_takes_memory_for_the_larger_side_twice() {
+    let keeper = keeper();
+    assert_eq!(keeper.cells((0, 0), (900, 1), false), 900);
+    assert_eq!(keeper.cells((0, 0), (900, 1), true), 810_000);
+}

@@ -1,0 +1,108 @@
+//! A learner that only ingests, as a process of its own: the real service, and in place of the trainer a loop that opens
+//! one plan after the other and throws the results away.
+
+use super::actors::Load;
+use anyhow::{Context as _, anyhow};
+use magex_learner::collector::{CollectError, Collector as _};
+use magex_learner::ingest::Limits;
+use magex_learner::service::{DEFAULT_LEASE, RunIdentity, learner_service};
+use magex_runtime::{process, server, shutdown};
+use rustix::process::{Pid, Signal, kill_process};
+use std::process::Stdio;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::process::{Child, Command};
+
+/// Options of the hidden role.
+#[derive(Debug, Clone, clap::Args)]
+pub(in super::super) struct IngestArgs {
+    #[arg(long)]
+    agents: usize,
+    #[arg(long)]
+    episodes: u32,
+}
+
+/// Serves until it is told to stop.
+pub(in super::super) fn serve(args: &IngestArgs) -> anyhow::Result<u8> {
+    let load = Load::new(args.agents, args.episodes);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    runtime.block_on(async {
+        let stop = shutdown::on_signal()?;
+        let run = RunIdentity {
+            run_id: load.weights.run_id.clone(),
+            name: "ingest".into(),
+            task_fingerprint: load.task.fingerprint(),
+            run_config_toml: String::new(),
+            seed: 0,
+            lease: DEFAULT_LEASE,
+        };
+        let limits = Limits { max_actors: 1024, ..Limits::for_task(&load.task, args.episodes as usize) };
+        let (handle, mut collector) = learner_service(run, limits);
+        let (incoming, address) = server::bind("127.0.0.1:0").await?;
+        process::announce_ready("learner", Some(address), None);
+        let serving = tokio::spawn(async move { handle.serve(incoming, stop).await });
+        let (weights, plan) = (load.weights.clone(), load.plan.clone());
+        let trainer = std::thread::spawn(move || -> Result<(), CollectError> {
+            collector.publish(&weights)?;
+            loop {
+                match collector.collect(plan.clone()) {
+                    Ok(results) => drop(results),
+                    Err(CollectError::Stopped(_)) => return Ok(()),
+                    Err(error) => return Err(error),
+                }
+            }
+        });
+        serving.await??;
+        trainer.join().map_err(|_| anyhow!("the collecting thread died"))??;
+        anyhow::Ok(())
+    })?;
+    runtime.shutdown_background();
+    Ok(super::done())
+}
+
+/// The process.
+pub(super) struct Learner {
+    child: Child,
+    pub(super) url: String,
+}
+
+impl Learner {
+    pub(super) async fn start(load: &Load) -> anyhow::Result<Self> {
+        let (agents, episodes) = (load.task.agents.to_string(), load.plan.first().map_or(1, |shard| shard.episodes));
+        let mut child = Command::new(std::env::current_exe()?)
+            .args(["bench", "ingest", "--agents", &agents, "--episodes", &episodes.to_string()])
+            .env("RUST_LOG", "error")
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .kill_on_drop(true)
+            .spawn()?;
+        let stdout = child.stdout.take().context("it has no standard output")?;
+        let line = BufReader::new(stdout).lines().next_line().await?.unwrap_or_default();
+        let ready: serde_json::Value = serde_json::from_str(&line).unwrap_or_default();
+        let address = ready["address"].as_str().ok_or_else(|| anyhow!("the learner did not start"))?;
+        Ok(Self { url: format!("http://{address}"), child })
+    }
+
+    /// Most memory so far, MiB.
+    pub(super) fn peak_mib(&self) -> f64 {
+        super::super::vitals::memory_mib(self.child.id().unwrap_or_default(), "VmHWM:")
+    }
+
+    /// Asks it to stop; how long that took.
+    pub(super) async fn stop(&mut self) -> anyhow::Result<Duration> {
+        let pid = self.child.id().and_then(|id| Pid::from_raw(id as i32)).context("the learner has ended")?;
+        let start = Instant::now();
+        kill_process(pid, Signal::TERM)?;
+        self.child.wait().await?;
+        Ok(start.elapsed())
+    }
+}
+
+/// Weights that stand for any.
+pub(super) fn weights(bytes: usize, version: u32) -> Arc<magex_proto::weights::Weights> {
+    use magex_core::ids::{RunId, WeightsVersion};
+    let bytes: Vec<u8> = (0..bytes).map(|at| (at as u32 ^ version) as u8).collect();
+    let run_id = RunId("bench".into());
+    Arc::new(magex_proto::weights::Weights::new(run_id, WeightsVersion(version), bytes.into()))
+}

@@ -1,0 +1,317 @@
+//! `magex train-commander`: the learned goal scheduler alone, on synthetic instances.
+//!
+//! First it imitates the exact solver, then PPO goes on from there on the paper's reward R_c = 1 − C_c / C_h.
+
+use crate::cli::Global;
+use crate::failure::usage;
+use crate::folder;
+use crate::output::{Output, Table, note, program, seconds};
+use crate::settings;
+use crate::synthetic::Synthetic;
+use anyhow::Context as _;
+use magex_assign::exact_points;
+use magex_core::config::{CommanderKind, RunConfig};
+use magex_core::ids::Mode;
+use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::task::Spawn;
+use magex_learner::checkpoint::sha256_hex;
+use magex_learner::commander::{CommanderPpo, CommanderState, Lesson, Sample, cost, greedy_cost};
+use magex_nets::commander::Commander;
+use magex_nets::params::to_safetensors;
+use magex_runtime::exit;
+use serde_json::{Value, json};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+const AFTER_HELP: &str = "\
+Examples:
+  magex train-commander --out runs/scheduler              imitation, then PPO: about a minute
+  magex train-commander my.toml --ppo 0 --seed 2          the [commander] section of my.toml, imitation only
+  magex commander --weights runs/scheduler                serves it
+  magex bench commander --run runs/scheduler              measures it on other instances
+
+The folder gets config.toml, metrics.jsonl, weights.safetensors (the commander alone: magex eval needs a run of
+magex train) and summary.json. The same options and seed give the same weights with any number of threads.
+
+Exit codes: 0 done, 1 training failed, 64 wrong usage or configuration, 73 --out exists or cannot be written";
+
+/// Train the goal scheduler alone, on synthetic teams of 2 to 200 agents.
+#[derive(Debug, Clone, clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub(crate) struct TrainCommanderArgs {
+    /// Configuration file (TOML); its [commander] section and run.seed count.
+    #[arg(value_name = "CONFIG.toml")]
+    config: Option<PathBuf>,
+    /// Folder of the result [default: runs/commander-s<seed>, with -2, -3, … if it exists].
+    #[arg(long, short, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Seed of weights, instances and samples [run.seed].
+    #[arg(long, value_name = "S")]
+    seed: Option<u64>,
+    /// Gradient steps of imitation.
+    #[arg(long, value_name = "K", default_value_t = 300)]
+    imitation: u32,
+    /// Updates of PPO.
+    #[arg(long, value_name = "K", default_value_t = 200)]
+    ppo: u32,
+    /// Synthetic instances per step or update.
+    #[arg(long, value_name = "K", default_value_t = 64, value_parser = settings::count)]
+    batch: u32,
+    /// Threads that draw and solve instances [default: the cores of this machine].
+    #[arg(long, value_name = "T", value_parser = settings::threads)]
+    threads: Option<usize>,
+}
+
+/// Sets of instances; `bench` uses other ones.
+const IMITATION: u32 = 3;
+const REWARD: u32 = 4;
+const VALIDATION: u32 = 5;
+
+/// Team sizes on which progress is measured, and instances of each, half of them uniform, half on lines.
+const VALIDATION_SIZES: [usize; 5] = [5, 20, 50, 100, 200];
+const VALIDATION_INSTANCES: u32 = 32;
+
+/// Lines of metrics.jsonl.
+const MEASUREMENTS: u32 = 20;
+
+pub(crate) fn run(args: &TrainCommanderArgs, global: &Global) -> anyhow::Result<u8> {
+    let mut config = settings::read(args.config.as_deref())?;
+    config.run.seed = args.seed.unwrap_or(config.run.seed);
+    let config = config.resolved()?;
+    if config.commander.kind != CommanderKind::Pairwise {
+        let kind = config.commander.kind;
+        return Err(usage(format!("commander.kind: {kind} does not serve teams of every size; use pairwise")));
+    }
+    if args.imitation + args.ppo == 0 {
+        return Err(usage("--imitation and --ppo: 0 steps teach nothing; give one of them"));
+    }
+    let out = args.out.clone().unwrap_or_else(|| default_out(config.run.seed));
+    folder::create(&out, &config)?;
+    let training = Training {
+        ppo: CommanderPpo::new(&config.commander, &config.task, config.run.seed),
+        args: args.clone(),
+        threads: args.threads.unwrap_or_else(settings::cores),
+        config,
+        out,
+    };
+    training.run(global.output())
+}
+
+fn default_out(seed: u64) -> PathBuf {
+    let name = |k: u32| {
+        Path::new("runs").join(if k == 1 { format!("commander-s{seed}") } else { format!("commander-s{seed}-{k}") })
+    };
+    (1..).map(name).find(|path| !path.exists()).unwrap_or_else(|| name(1))
+}
+
+struct Training {
+    config: RunConfig,
+    ppo: CommanderPpo,
+    args: TrainCommanderArgs,
+    threads: usize,
+    out: PathBuf,
+}
+
+impl Training {
+    fn run(&self, output: Output) -> anyhow::Result<u8> {
+        let clock = Instant::now();
+        let mut metrics = std::fs::File::create(self.out.join("metrics.jsonl")).context("metrics.jsonl")?;
+        let mut state = self.ppo.start()?;
+        let untrained = self.validate(&state)?;
+        let mut measured = untrained.clone();
+        let TrainCommanderArgs { imitation, ppo, batch, .. } = self.args;
+        for (stage, steps) in [("imitation", imitation), ("ppo", ppo)] {
+            for step in 0..steps {
+                let rate = 1.0 - f64::from(step) / f64::from(steps);
+                let (loss, entropy) = match stage {
+                    "imitation" => (self.imitate(&mut state, step, rate)?, None),
+                    _ => self.reinforce(&mut state, step, rate).map(|(loss, entropy)| (loss, Some(entropy)))?,
+                };
+                let done = step + 1;
+                if done % steps.div_ceil(MEASUREMENTS / 2).max(1) == 0 || done == steps {
+                    measured = self.validate(&state)?;
+                    let line = json!({
+                        "stage": stage, "step": done, "instances": u64::from(done) * u64::from(batch), "loss": loss,
+                        "entropy": entropy, "cost_ratio": named(&measured), "wall_s": clock.elapsed().as_secs_f64(),
+                    });
+                    writeln!(metrics, "{line}").context("metrics.jsonl")?;
+                    note(format!("{stage} {done} of {steps}: loss {loss:.4}, cost ratio {}", list(&measured)));
+                }
+            }
+        }
+        metrics.sync_all().context("metrics.jsonl")?;
+        let weights = to_safetensors(&[("commander", &state.params)], "{\"format\":1}")?;
+        let summary = json!({
+            "weights_sha256": sha256_hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
+            "batch": batch, "synthetic_instances": u64::from(imitation + ppo) * u64::from(batch),
+            "cost_ratio": named(&measured), "untrained_cost_ratio": named(&untrained),
+            "wall_s": clock.elapsed().as_secs_f64(),
+        });
+        self.write(folder::WEIGHTS, &weights)?;
+        self.write(folder::SUMMARY, &serde_json::to_vec(&summary)?)?;
+        self.tell(output, &untrained, &measured, summary);
+        Ok(exit::OK)
+    }
+
+    fn build(&self, state: &CommanderState) -> anyhow::Result<Commander> {
+        let mut source = state.params.source(state.params.plain()?);
+        Ok(Commander::build(&self.config.commander, self.config.task.agents, 2, &mut source)?)
+    }
+
+    fn stream(&self, set: u32, step: u32, k: u32) -> Stream {
+        Key::new(self.config.run.seed, Purpose::Instances, &[set, step, k]).stream()
+    }
+
+    fn imitate(&self, state: &mut CommanderState, step: u32, rate: f64) -> anyhow::Result<f64> {
+        let commander = self.build(state)?;
+        let lessons = in_parallel(self.threads, self.args.batch, |k| {
+            let team = Synthetic::draw(&mut self.stream(IMITATION, step, k));
+            let team = team.team();
+            let (exact, _) = exact_points(team.agents, team.goals, 2)?;
+            Ok(Lesson::new(&commander, &team, &exact)?)
+        })?;
+        Ok(self.ppo.imitate(state, &lessons, rate)?)
+    }
+
+    /// Sampled decisions, their advantage over the greedy ones, and PPO on them.
+    fn reinforce(&self, state: &mut CommanderState, step: u32, rate: f64) -> anyhow::Result<(f64, f64)> {
+        let commander = self.build(state)?;
+        let samples = in_parallel(self.threads, self.args.batch, |k| {
+            let synthetic = Synthetic::draw(&mut self.stream(REWARD, step, k));
+            let team = synthetic.team();
+            let instance = commander.instance(&team)?;
+            let scores = commander.scores(std::slice::from_ref(&instance))?.flatten_all()?.to_vec1::<f32>()?;
+            let mut stream = Key::new(self.config.run.seed, Purpose::Commander, &[step, k]).stream();
+            let (decision, picks) = instance.decide(&scores, Some(&mut stream));
+            let exact = exact_points(team.agents, team.goals, 2)?.1.max(1e-9);
+            let greedy = greedy_cost(&commander, &instance, &team)?;
+            let advantage = ((greedy - cost(&team, &decision.goals)) / exact) as f32;
+            Ok(Sample { instance, picks, advantage })
+        })?;
+        let stats = self.ppo.improve(state, &samples, step, rate)?;
+        Ok((stats.loss, stats.entropy))
+    }
+
+    /// Mean cost ratio of greedy decisions for each of the validation sizes.
+    fn validate(&self, state: &CommanderState) -> anyhow::Result<Vec<f64>> {
+        let commander = self.build(state)?;
+        let mut means = Vec::new();
+        for n in VALIDATION_SIZES {
+            let ratios = in_parallel(self.threads, VALIDATION_INSTANCES, |k| {
+                let layout = if k % 2 == 0 { Spawn::Uniform } else { Spawn::Lines(None) };
+                let synthetic = Synthetic::starts(n, layout, &mut self.stream(VALIDATION, n as u32, k));
+                let team = synthetic.team();
+                let mut unused = Key::new(0, Purpose::Commander, &[]).stream();
+                let goals = commander.assign(&team, Mode::Greedy, &mut unused)?.goals;
+                Ok(cost(&team, &goals) / exact_points(team.agents, team.goals, 2)?.1.max(1e-9))
+            })?;
+            means.push(ratios.iter().sum::<f64>() / ratios.len() as f64);
+        }
+        Ok(means)
+    }
+
+    /// Whole files only.
+    fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
+        let temporary = self.out.join(format!(".{name}.tmp"));
+        let path = self.out.join(name);
+        let written = std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, &path));
+        written.with_context(|| path.display().to_string())
+    }
+
+    fn tell(&self, output: Output, untrained: &[f64], measured: &[f64], mut summary: Value) {
+        let mut table = Table::new(1, &["N", "untrained", "trained"]);
+        for ((n, before), after) in VALIDATION_SIZES.iter().zip(untrained).zip(measured) {
+            table.row(vec![n.to_string(), format!("{before:.5}"), format!("{after:.5}")]);
+        }
+        let wall = seconds(summary["wall_s"].as_f64().unwrap_or_default());
+        let out = self.out.display();
+        output.say(format!(
+            "\nDone in {wall}. Cost over the exact cost on {VALIDATION_INSTANCES} unseen instances each:\n\n{table}\n"
+        ));
+        output.say(format!(
+            "Next:\n  {magex} bench commander --run {out}\n  {magex} commander --weights {out}",
+            magex = program()
+        ));
+        summary["out"] = json!(self.out);
+        output.result(&summary);
+    }
+}
+
+fn named(ratios: &[f64]) -> Value {
+    VALIDATION_SIZES
+        .iter()
+        .zip(ratios)
+        .map(|(n, ratio)| (n.to_string(), json!(ratio)))
+        .collect::<serde_json::Map<_, _>>()
+        .into()
+}
+
+fn list(ratios: &[f64]) -> String {
+    let one = |(n, ratio): (&usize, &f64)| format!("{ratio:.5} (N = {n})");
+    VALIDATION_SIZES.iter().zip(ratios).map(one).collect::<Vec<_>>().join(", ")
+}
+
+/// `work` of 0..count on several threads; the results are in order, so their number does not matter.
+fn in_parallel<T: Send>(
+    threads: usize,
+    count: u32,
+    work: impl Fn(u32) -> anyhow::Result<T> + Sync,
+) -> anyhow::Result<Vec<T>> {
+    let threads = threads.clamp(1, count.max(1) as usize) as u32;
+    let parts: Vec<anyhow::Result<Vec<T>>> = std::thread::scope(|scope| {
+        let part = |from: u32| -> Vec<u32> { (from * count / threads..(from + 1) * count / threads).collect() };
+        let spawn =
+            |indices: Vec<u32>| scope.spawn(|| indices.into_iter().map(&work).collect::<anyhow::Result<Vec<T>>>());
+        let handles: Vec<_> = (0..threads).map(part).map(spawn).collect();
+        let failed = |_| Err(anyhow::anyhow!("a thread panicked; its last words are above"));
+        handles.into_iter().map(|handle| handle.join().unwrap_or_else(failed)).collect()
+    });
+    let mut all = Vec::with_capacity(count as usize);
+    for part in parts {
+        all.extend(part?);
+    }
+    Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_order_of_results_does_not_depend_on_the_threads() {
+        for threads in [1, 2, 3, 64] {
+            assert_eq!(in_parallel(threads, 7, |k| Ok(k * k)).unwrap(), [0, 1, 4, 9, 16, 25, 36]);
+        }
+        assert!(in_parallel(2, 7, |k| if k == 6 { anyhow::bail!("six") } else { Ok(k) }).is_err());
+    }
+
+    #[test]
+    fn a_short_training_leaves_a_folder_that_loads_and_the_same_weights_with_any_number_of_threads() {
+        let place = std::env::temp_dir().join(format!("magex-train-commander-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&place);
+        let train = |threads: usize| {
+            let out = place.join(threads.to_string());
+            let config = RunConfig::default();
+            let args = TrainCommanderArgs {
+                config: None,
+                out: None,
+                seed: None,
+                imitation: 2,
+                ppo: 1,
+                batch: 4,
+                threads: None,
+            };
+            folder::create(&out, &config).unwrap();
+            let ppo = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
+            Training { config, ppo, args, threads, out: out.clone() }.run(Output::new(true)).unwrap();
+            let loaded = folder::load(&out, None).unwrap();
+            assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
+            crate::local::commander(&loaded.config, &loaded.weights, None).unwrap();
+            assert_eq!(std::fs::read_to_string(out.join("metrics.jsonl")).unwrap().lines().count(), 3);
+            loaded.sha256
+        };
+        assert_eq!(train(1), train(2));
+        std::fs::remove_dir_all(&place).unwrap();
+    }
+}

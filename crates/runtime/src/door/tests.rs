@@ -1,0 +1,114 @@
+use super::*;
+use crate::admission::FlightLimits;
+use http_body::Body as _;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tonic::codegen::Bytes;
+
+/// A body of whatever is sent to it.
+struct Chunks(mpsc::UnboundedReceiver<Bytes>);
+
+impl http_body::Body for Chunks {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        self.0.poll_recv(cx).map(|chunk| chunk.map(|bytes| Ok(Frame::data(bytes))))
+    }
+}
+
+fn metered(kind: Kind, strict: bool) -> (mpsc::UnboundedSender<Bytes>, Metered) {
+    let limits = FlightLimits { calls: 1, streams: 1, caller_bytes: 1 << 20, bytes: 1 << 20 };
+    let admission = Admission::new(limits, CancellationToken::new());
+    let slot = admission.enter(&Caller { name: "a".into(), role: Role::Client }, kind).unwrap();
+    let (chunks, receiver) = mpsc::unbounded_channel();
+    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(slot), kind, 100, strict))
+}
+
+async fn next(body: &mut Metered) -> Option<Result<Frame<Bytes>, Status>> {
+    std::future::poll_fn(|cx| Pin::new(&mut *body).poll_frame(cx)).await
+}
+
+fn message(length: u8) -> Vec<u8> {
+    [&[0, 0, 0, 0, length][..], &vec![7; length as usize]].concat()
+}
+
+#[tokio::test]
+async fn every_message_of_a_stream_has_its_own_time() {
+    let (_chunks, mut body) = metered(Kind::Stream, false);
+    let begin = |body: &mut Metered| body.patience = Some(Box::pin(tokio::time::sleep(MESSAGE)));
+    let (first, second) = (message(8), message(8));
+    body.count(&first[..9]).unwrap();
+    assert!(body.begun);
+    begin(&mut body);
+    body.count(&first[9..11]).unwrap();
+    assert!(body.begun && body.patience.is_some(), "more of the same message brings no more time");
+    // Never a silence between two messages.
+    body.count(&[&first[11..], &second[..9]].concat()).unwrap();
+    assert!(body.begun && body.patience.is_none());
+    begin(&mut body);
+    body.count(&[&second[9..], &message(0)[..], &message(0)[..3]].concat()).unwrap();
+    assert!(body.begun && body.patience.is_none());
+    begin(&mut body);
+    body.count(&message(0)[3..]).unwrap();
+    assert!(!body.begun && body.patience.is_none(), "a stream may be silent between messages");
+}
+
+#[tokio::test]
+async fn whoever_begins_a_message_and_does_not_end_it_is_left() {
+    for kind in [Kind::Stream, Kind::Call] {
+        let (chunks, mut body) = metered(kind, false);
+        chunks.send(Bytes::copy_from_slice(&message(8)[..9])).unwrap();
+        next(&mut body).await.unwrap().unwrap();
+        body.patience = Some(Box::pin(tokio::time::sleep(std::time::Duration::from_millis(20))));
+        let error = next(&mut body).await.unwrap().unwrap_err();
+        assert_eq!(error.code(), tonic::Code::DeadlineExceeded, "{error}");
+    }
+}
+
+#[tokio::test]
+async fn guests_send_short_messages_only() {
+    for (strict, refused) in [(true, true), (false, false)] {
+        let (chunks, mut body) = metered(Kind::Call, strict);
+        chunks.send(message(101).into()).unwrap();
+        assert_eq!(next(&mut body).await.unwrap().is_err(), refused);
+    }
+}
+
+/// Says nothing, ever.
+#[derive(Clone)]
+struct Mute;
+
+impl Service<http::Request<Body>> for Mute {
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = std::future::Pending<Result<http::Response<Body>, Infallible>>;
+
+    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn call(&mut self, _: http::Request<Body>) -> Self::Future {
+        std::future::pending()
+    }
+}
+
+#[tokio::test]
+async fn guests_hold_a_bounded_number_of_calls() {
+    let (incoming, _) = crate::server::bind("127.0.0.1:0").await.unwrap();
+    let mut open = Open::new(Mute, incoming.connections());
+    let mut held = Vec::new();
+    let refused = loop {
+        let mut answer = open.call(http::Request::builder().uri("/s/Watch").body(Body::empty()).unwrap());
+        match std::future::poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
+            Poll::Pending => held.push(answer),
+            Poll::Ready(Ok(response)) => break Status::from_header_map(response.headers()).unwrap(),
+            Poll::Ready(Err(never)) => match never {},
+        }
+        assert!(held.len() < 10_000);
+    };
+    assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
+    // Calls have places of their own.
+    let mut other = open.call(http::Request::builder().uri("/s/Check").body(Body::empty()).unwrap());
+    assert!(std::future::poll_fn(|cx| Poll::Ready(other.as_mut().poll(cx))).await.is_pending());
+}

@@ -1,0 +1,246 @@
+//! Asking a service whether it is well: for orchestrators, from inside its container, without further programs.
+
+use crate::client::{UrlError, endpoint_with};
+use crate::exit::{self, Failure};
+use crate::tls::{ClientTls, TlsError};
+use std::time::Duration;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+/// A service that does not answer within this time is not well, unless told otherwise.
+pub const DEADLINE: Duration = Duration::from_secs(2);
+
+/// Longest answer of a page that is read.
+const PAGE: u64 = 4096;
+
+/// Why a service is not well.
+#[derive(Debug, thiserror::Error)]
+pub enum Unhealthy {
+    /// The address makes no sense.
+    #[error(transparent)]
+    Url(#[from] UrlError),
+    /// The certificates that the environment names.
+    #[error("{0}")]
+    Tls(#[from] TlsError),
+    /// Nobody is there, or nobody who understands the question.
+    #[error("{url}: {reason}")]
+    Unreachable {
+        /// Who was asked.
+        url: String,
+        /// What went wrong.
+        reason: String,
+    },
+    /// It says so itself.
+    #[error("{url} says {status}")]
+    NotServing {
+        /// Who was asked.
+        url: String,
+        /// What it said.
+        status: String,
+    },
+    /// It does not answer.
+    #[error("{url} did not answer within {} s", .deadline.as_secs_f64())]
+    Late {
+        /// Who was asked.
+        url: String,
+        /// How long it was waited for.
+        deadline: Duration,
+    },
+}
+
+/// Asks the service at `url` once. A url without a path is asked over gRPC (grpc.health.v1) about `service`, which may be
+/// empty for the whole process; https takes the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY`
+/// name. A url with a path is a page, http://host:port/healthz, that must answer 200.
+///
+/// # Errors
+/// It is not well.
+pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Unhealthy> {
+    let asking = async {
+        match page_of(url) {
+            Some((authority, path)) => ask_page(url, authority, path).await,
+            None => ask_grpc(url, service).await,
+        }
+    };
+    let late = |_| Unhealthy::Late { url: url.to_owned(), deadline };
+    tokio::time::timeout(deadline, asking).await.map_err(late)?
+}
+
+/// [`ask`] on a runtime of its own. The exit code, or what is wrong.
+///
+/// # Errors
+/// Wrong usage, or the service is not well.
+pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    runtime.block_on(ask(url, service, deadline)).map(|()| exit::OK).map_err(|error| match &error {
+        Unhealthy::Url(_) | Unhealthy::Tls(_) => Failure::usage(&error),
+        _ => Failure::new(exit::FAILURE, &error),
+    })
+}
+
+/// Asks the service of this machine that was started with these options.
+///
+/// # Errors
+/// As [`run`].
+pub fn own(listen: &str, secure: bool) -> Result<u8, Failure> {
+    let scheme = if secure { "https" } else { "http" };
+    run(&format!("{scheme}://{}", reachable(listen)), "", DEADLINE)
+}
+
+/// Asks for the page of the program of this machine that was started with these options.
+///
+/// # Errors
+/// As [`run`]; no address is wrong usage.
+pub fn own_page(listen: Option<&str>) -> Result<u8, Failure> {
+    let listen = listen.ok_or_else(|| {
+        Failure::usage("--health-check asks for the page at --http (MAGEX_HTTP), and there is no such address; set it")
+    })?;
+    run(&format!("http://{}/healthz", reachable(listen)), "", DEADLINE)
+}
+
+/// Where a listener is reached from its own machine. The name of every loopback address is localhost: certificates have
+/// names.
+fn reachable(listen: &str) -> String {
+    let (host, port) = listen.rsplit_once(':').unwrap_or((listen, ""));
+    let address = host.trim_start_matches('[').trim_end_matches(']').parse::<std::net::IpAddr>();
+    match address {
+        Ok(address) if address.is_unspecified() || address == std::net::Ipv4Addr::LOCALHOST => {
+            format!("localhost:{port}")
+        }
+        _ => listen.to_owned(),
+    }
+}
+
+/// Host with port, and path, of a url that names a page.
+fn page_of(url: &str) -> Option<(&str, &str)> {
+    let rest = url.strip_prefix("http://")?;
+    let slash = rest.find('/')?;
+    let (authority, path) = rest.split_at(slash);
+    (path.len() > 1).then_some((authority, path))
+}
+
+async fn ask_grpc(url: &str, service: &str) -> Result<(), Unhealthy> {
+    let unreachable = |reason: String| Unhealthy::Unreachable { url: url.to_owned(), reason };
+    let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
+    let tls = if secure { Some(ClientTls::from_env()?) } else { None };
+    let endpoint = endpoint_with(url, tls.as_ref())?;
+    let channel = endpoint.connect().await.map_err(|error| unreachable(root_of(&error)))?;
+    let request = HealthCheckRequest { service: service.to_owned() };
+    let answer = HealthClient::new(channel).check(request).await.map_err(|status| match status.code() {
+        Code::NotFound => unreachable(format!("there is no service '{service}'")),
+        code => unreachable(format!("{code:?}: {}", status.message())),
+    })?;
+    let status = answer.into_inner().status();
+    if status == ServingStatus::Serving {
+        return Ok(());
+    }
+    Err(Unhealthy::NotServing { url: url.to_owned(), status: status.as_str_name().to_owned() })
+}
+
+/// What went wrong in the end: the layers above only say that something did.
+fn root_of(error: &dyn std::error::Error) -> String {
+    let mut root = error;
+    while let Some(source) = root.source() {
+        root = source;
+    }
+    root.to_string()
+}
+
+async fn ask_page(url: &str, authority: &str, path: &str) -> Result<(), Unhealthy> {
+    let unreachable = |error: std::io::Error| Unhealthy::Unreachable { url: url.to_owned(), reason: error.to_string() };
+    let mut socket = TcpStream::connect(authority).await.map_err(unreachable)?;
+    let request = format!("GET {path} HTTP/1.0\r\nHost: {authority}\r\n\r\n");
+    socket.write_all(request.as_bytes()).await.map_err(unreachable)?;
+    let mut answer = Vec::new();
+    socket.take(PAGE).read_to_end(&mut answer).await.map_err(unreachable)?;
+    let text = String::from_utf8_lossy(&answer);
+    let line = text.lines().next().unwrap_or_default();
+    if line.split_whitespace().nth(1) == Some("200") {
+        return Ok(());
+    }
+    let status = if line.is_empty() { "nothing".to_owned() } else { format!("'{line}'") };
+    Err(Unhealthy::NotServing { url: url.to_owned(), status })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::health::Health;
+    use crate::server;
+    use tokio_util::sync::CancellationToken;
+
+    struct Named;
+    impl tonic::server::NamedService for Named {
+        const NAME: &'static str = "test.Named";
+    }
+
+    const SOON: Duration = Duration::from_secs(5);
+
+    #[tokio::test]
+    async fn a_service_is_well_from_when_it_says_so_until_it_says_otherwise() {
+        let (incoming, address) = server::bind("127.0.0.1:0").await.unwrap();
+        let (health, service) = Health::new::<Named>().await;
+        let stop = CancellationToken::new();
+        let router = server::builder().add_service(service);
+        let serving = tokio::spawn(server::serve(router, incoming, stop.clone(), Duration::ZERO));
+        let url = format!("http://{address}");
+        for (well, service) in [(false, ""), (true, ""), (true, "test.Named"), (false, "test.Named")] {
+            health.set(well).await;
+            let answer = ask(&url, service, SOON).await;
+            assert_eq!(answer.is_ok(), well, "{answer:?}");
+            assert!(well || answer.unwrap_err().to_string().contains("NOT_SERVING"));
+        }
+        let error = ask(&url, "test.Other", SOON).await.unwrap_err().to_string();
+        assert!(error.contains("no service 'test.Other'"), "{error}");
+        stop.cancel();
+        serving.await.unwrap().unwrap();
+        let error = ask(&url, "", SOON).await.unwrap_err();
+        assert!(matches!(error, Unhealthy::Unreachable { .. }), "{error}");
+    }
+
+    #[tokio::test]
+    async fn a_page_must_answer_200() {
+        let page = crate::http::bind("127.0.0.1:0").await.unwrap();
+        let (address, stop) = (page.address(), CancellationToken::new());
+        let metrics = std::sync::Arc::new(crate::metrics::Metrics::new());
+        let serving = page.serve(crate::http::routes(metrics), stop.clone());
+        ask(&format!("http://{address}/healthz"), "", SOON).await.unwrap();
+        let error = ask(&format!("http://{address}/nothing"), "", SOON).await.unwrap_err().to_string();
+        assert!(error.contains("404"), "{error}");
+        stop.cancel();
+        serving.await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn who_says_nothing_is_not_waited_for() {
+        let mute = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = mute.local_addr().unwrap();
+        for url in [format!("http://{address}"), format!("http://{address}/healthz")] {
+            let error = ask(&url, "", Duration::from_millis(200)).await.unwrap_err();
+            assert!(matches!(error, Unhealthy::Late { .. }), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_listener_is_reached_by_name_from_its_own_machine() {
+        let cases = [
+            ("0.0.0.0:7000", "localhost:7000"),
+            ("[::]:7000", "localhost:7000"),
+            ("127.0.0.1:7000", "localhost:7000"),
+            ("10.0.0.1:7000", "10.0.0.1:7000"),
+            ("learner:7000", "learner:7000"),
+        ];
+        for (listen, url) in cases {
+            assert_eq!(reachable(listen), url);
+        }
+        assert_eq!(page_of("http://h:1/healthz"), Some(("h:1", "/healthz")));
+        assert_eq!((page_of("http://h:1/"), page_of("http://h:1"), page_of("https://h:1/x")), (None, None, None));
+        assert_eq!(own_page(None).unwrap_err().code, exit::USAGE);
+    }
+}

@@ -1,0 +1,327 @@
+//! A recorded episode as a page draws it: sizes of the task and packed states. The drawing itself is [`SCRIPT`], which the
+//! live page and the replay files share.
+//!
+//! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
+//! and knows no task by name; three dimensions are seen from above, from the side and in space.
+
+use magex_core::task::{DroneConfig, Group, TaskConfig, TaskName};
+use magex_core::trajectory::{EpisodeMetrics, Recording};
+use serde::{Serialize, Serializer};
+
+/// Defines `makeScene`, which draws an episode on a canvas.
+pub const SCRIPT: &str = include_str!("scene.js");
+
+/// States are stored as whole multiples of this; as a length in world units, a fifth of a pixel on a map of side 2.
+pub const UNIT: f64 = 1e-3;
+
+/// A recording that cannot be drawn.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {reason}")]
+pub struct SceneError {
+    /// Which array.
+    pub field: &'static str,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+/// What the script needs to know besides the states. Lengths are in world units.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Scene {
+    /// Side of the map, which is centred on the origin.
+    pub side: f32,
+    /// What a world unit is called, in the plural.
+    pub length_unit: &'static str,
+    /// What an agent is called.
+    pub agent_name: &'static str,
+    /// What an agent is that is out of the episode.
+    pub out_name: &'static str,
+    /// Radius of an agent.
+    pub agent_radius: f32,
+    /// Radius of the bodies that are not agents.
+    pub ball_radius: f32,
+    /// Radius a landmark is drawn with.
+    pub landmark_radius: f32,
+    /// Two agents closer than this are in contact.
+    pub contact_distance: f32,
+    /// A landmark is covered by a member of the last group but one of the chain within this distance.
+    pub cover_radius: f32,
+    /// Simulated seconds per step.
+    pub step_seconds: f32,
+    /// Height of the ground, if there is one.
+    pub ground: Option<f32>,
+    /// The groups from the agents to the landmarks, K + 1 of them: the k-th goal of an agent is a member of entry k + 1.
+    #[serde(serialize_with = "group_names")]
+    pub chain: Vec<Group>,
+    /// Which of an agent's extras begin its target velocity.
+    pub target_velocity: Option<usize>,
+    /// Which of an agent's extras are x and y of its upward axis; the first of the two.
+    pub up: Option<usize>,
+    /// Which of an agent's extras says (by 1) that it crashed: it covers nothing any more.
+    pub out: Option<usize>,
+    /// [`UNIT`].
+    pub unit: f64,
+}
+
+impl Scene {
+    /// The sizes of a task (paper, section 5.1).
+    pub fn of(task: &TaskConfig) -> Self {
+        let (seen, stages) = (task.observation(), task.stages());
+        let flies = task.name == TaskName::Drones;
+        let (landmark_radius, step_seconds) = match task.name {
+            TaskName::SimpleSpread => (0.05, 0.1),
+            TaskName::PushBall => (0.15, 0.1),
+            TaskName::Drones => (0.03, 1.0 / DroneConfig::COMMANDS_HZ as f32),
+        };
+        Self {
+            side: task.side,
+            length_unit: if flies { "metres" } else { "world units" },
+            agent_name: if flies { "drone" } else { "agent" },
+            out_name: "crashed",
+            agent_radius: seen.contact / 2.0,
+            ball_radius: 0.15,
+            landmark_radius,
+            contact_distance: seen.contact,
+            cover_radius: seen.reached,
+            step_seconds,
+            ground: flies.then_some(0.0),
+            chain: stages.iter().take(1).map(|stage| stage.from).chain(stages.iter().map(|stage| stage.to)).collect(),
+            target_velocity: flies.then_some(0),
+            up: flies.then_some(3),
+            out: seen.out,
+            unit: UNIT,
+        }
+    }
+
+    /// How many of an agent's extras the script reads.
+    pub fn extras(&self) -> usize {
+        let ends = [self.target_velocity.map(|x| x + 3), self.up.map(|x| x + 2), self.out.map(|x| x + 1)];
+        ends.into_iter().flatten().max().unwrap_or(0)
+    }
+
+    /// An episode, ready for the script.
+    ///
+    /// # Errors
+    /// Arrays that do not fit their shape or the task, or are not finite.
+    pub fn pack<'a>(
+        &self,
+        name: &'a str,
+        recording: &'a Recording,
+        metrics: Option<&EpisodeMetrics>,
+    ) -> Result<PackedEpisode<'a>, SceneError> {
+        let wide = self.check(recording)?;
+        let shape = &recording.shape;
+        Ok(PackedEpisode {
+            name,
+            steps: shape.steps,
+            agents: shape.agents,
+            bodies: shape.bodies,
+            landmarks: shape.landmarks,
+            dims: shape.dims,
+            extras: shape.extras,
+            targets: shape.targets,
+            wide,
+            positions: pack(&recording.positions, wide),
+            extra_values: pack(&recording.extras, wide),
+            landmarks_at: pack(&recording.landmarks, wide),
+            goals: &recording.goals,
+            facts: metrics.map(|metrics| self.facts(metrics)).unwrap_or_default(),
+        })
+    }
+
+    /// Whether some number needs 32 bits.
+    fn check(&self, recording: &Recording) -> Result<bool, SceneError> {
+        let shape = &recording.shape;
+        let wrong = |field, reason| SceneError { field, reason };
+        if shape.agents == 0 || shape.dims == 0 || shape.targets == 0 || shape.bodies < shape.agents {
+            let reason = "agents, dims and targets must be at least 1 and bodies as many as agents";
+            return Err(wrong("shape", reason.to_owned()));
+        }
+        if shape.targets + 1 != self.chain.len() {
+            let expected = self.chain.len().saturating_sub(1);
+            return Err(wrong(
+                "shape",
+                format!("targets is {}, the task assigns {expected} to an agent", shape.targets),
+            ));
+        }
+        if shape.extras < self.extras() {
+            return Err(wrong("shape", format!("extras is {}, the task has {} or more", shape.extras, self.extras())));
+        }
+        let floats = [
+            ("positions", &recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
+            ("extras", &recording.extras, (shape.steps + 1) * shape.agents * shape.extras),
+            ("landmarks", &recording.landmarks, shape.landmarks * shape.dims),
+        ];
+        let mut wide = false;
+        for (field, values, expected) in floats {
+            if values.len() != expected {
+                return Err(wrong(field, format!("{} numbers, the shape asks for {expected}", values.len())));
+            }
+            if let Some(place) = values.iter().position(|x| x.is_nan() || x.abs() > 2e6) {
+                return Err(wrong(field, format!("entry {place} is {}, which cannot be drawn", values[place])));
+            }
+            wide |= values.iter().any(|&x| quantised(x).abs() > i32::from(i16::MAX));
+        }
+        if recording.goals.len() != shape.agents * shape.targets {
+            let expected = shape.agents * shape.targets;
+            return Err(wrong("goals", format!("{} entries, the shape asks for {expected}", recording.goals.len())));
+        }
+        for (place, &goal) in recording.goals.iter().enumerate() {
+            let group = self.chain[place % shape.targets + 1];
+            let members = match group {
+                Group::Agents => shape.agents,
+                Group::Balls => shape.bodies - shape.agents,
+                Group::Landmarks => shape.landmarks,
+            };
+            if goal as usize >= members {
+                let reason = format!("entry {place} is {goal}, there are {members} {}", group_name(group));
+                return Err(wrong("goals", reason));
+            }
+        }
+        Ok(wide)
+    }
+
+    /// What an episode scored, in words.
+    pub fn facts(&self, metrics: &EpisodeMetrics) -> Vec<(&'static str, String)> {
+        let known = [
+            ("success at the start", Some(metrics.spawn_success)),
+            ("success at the end", Some(metrics.success)),
+            ("matched success", Some(metrics.matched_success)),
+            ("collision rate", self.out.map(|_| metrics.collision_rate)),
+            ("assignment cost ratio", Some(metrics.cost_ratio)),
+            ("second cost ratio", metrics.second_cost_ratio),
+            ("mean reward", Some(metrics.reward)),
+        ];
+        known.into_iter().filter_map(|(name, value)| value.map(|value| (name, format!("{value:.3}")))).collect()
+    }
+}
+
+/// One episode as the script reads it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PackedEpisode<'a> {
+    name: &'a str,
+    steps: usize,
+    agents: usize,
+    bodies: usize,
+    landmarks: usize,
+    dims: usize,
+    extras: usize,
+    targets: usize,
+    /// 32-bit instead of 16-bit numbers.
+    wide: bool,
+    /// `[T+1, E, D]`, base64 of little-endian whole multiples of the unit.
+    positions: String,
+    /// `[T+1, N, X]`, the same.
+    extra_values: String,
+    /// `[G, D]`, the same.
+    landmarks_at: String,
+    /// `[N, K]`
+    goals: &'a [u32],
+    facts: Vec<(&'static str, String)>,
+}
+
+/// What the script calls a group.
+fn group_name(group: Group) -> &'static str {
+    match group {
+        Group::Agents => "agents",
+        Group::Balls => "balls",
+        Group::Landmarks => "landmarks",
+    }
+}
+
+fn group_names<S: Serializer>(chain: &[Group], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(chain.iter().map(|&group| group_name(group)))
+}
+
+fn quantised(value: f32) -> i32 {
+    (f64::from(value) / UNIT).round() as i32
+}
+
+fn pack(values: &[f32], wide: bool) -> String {
+    let bytes: Vec<u8> = if wide {
+        values.iter().flat_map(|&x| quantised(x).to_le_bytes()).collect()
+    } else {
+        values.iter().flat_map(|&x| (quantised(x) as i16).to_le_bytes()).collect()
+    };
+    base64(&bytes)
+}
+
+/// RFC 4648, with padding.
+pub(crate) fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for group in bytes.chunks(3) {
+        let byte = |k: usize| u32::from(group.get(k).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for digit in 0..4 {
+            if digit <= group.len() {
+                text.push(char::from(DIGITS[(bits >> (18 - 6 * digit)) as usize & 63]));
+            } else {
+                text.push('=');
+            }
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::task::Spawn;
+
+    #[test]
+    fn base64_of_the_standard() {
+        for (plain, text) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
+            assert_eq!(base64(plain.as_bytes()), text);
+        }
+    }
+
+    #[test]
+    fn states_are_whole_multiples_of_the_unit() {
+        assert_eq!(quantised(-40.0), -40_000);
+        assert_eq!(quantised(0.0015), 2);
+        assert_eq!(pack(&[-1.5, 1.0], false), base64(&[0x24, 0xfa, 0xe8, 0x03]));
+        assert_eq!(pack(&[-1.5], true), base64(&[0x24, 0xfa, 0xff, 0xff]));
+    }
+
+    #[test]
+    fn each_task_brings_its_own_sizes() {
+        let scene = |name| Scene::of(&TaskConfig::of(name, 5, Spawn::Uniform));
+        let sizes = |name| {
+            let s = scene(name);
+            (s.agent_radius, s.landmark_radius, s.contact_distance, s.cover_radius, s.step_seconds)
+        };
+        assert_eq!(sizes(TaskName::SimpleSpread), (0.1, 0.05, 0.2, 0.15, 0.1));
+        assert_eq!(sizes(TaskName::PushBall), (0.1, 0.15, 0.2, 0.3, 0.1));
+        assert_eq!(sizes(TaskName::Drones), (0.06, 0.03, 0.12, 0.15, 1.0 / 30.0));
+        for name in [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones] {
+            let (task, scene) = (TaskConfig::of(name, 5, Spawn::Uniform), scene(name));
+            assert_eq!(scene.chain.len(), task.stages().len() + 1, "{name}");
+            assert_eq!((scene.extras(), scene.side), (task.extras(), task.side), "{name}");
+        }
+    }
+
+    #[test]
+    fn facts_that_a_task_does_not_have_are_left_out() {
+        let mut metrics = EpisodeMetrics {
+            success: 0.75,
+            matched_success: 0.5,
+            spawn_success: 0.125,
+            arrival_step: 61,
+            collisions_per_agent_step: 0.0,
+            collision_rate: 0.25,
+            reward: 0.5,
+            cost_ratio: 1.0,
+            second_cost_ratio: None,
+        };
+        let value = |name, metrics: &EpisodeMetrics, fact: &str| {
+            let facts = Scene::of(&TaskConfig::of(name, 5, Spawn::Uniform)).facts(metrics);
+            facts.into_iter().find(|(key, _)| *key == fact).map(|(_, value)| value)
+        };
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "success at the start").as_deref(), Some("0.125"));
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "collision rate"), None);
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "second cost ratio"), None);
+        assert_eq!(value(TaskName::Drones, &metrics, "collision rate").as_deref(), Some("0.250"));
+        metrics.second_cost_ratio = Some(1.25);
+        assert_eq!(value(TaskName::PushBall, &metrics, "second cost ratio").as_deref(), Some("1.250"));
+    }
+}

@@ -1,0 +1,168 @@
+//! The numbers of metrics.jsonl once more, as TensorBoard reads them: `tensorboard/events.out.tfevents.NNNN` in the run folder.
+//!
+//! Each process of a run writes a file of its own. The file of a resumed run begins by saying from which step on it counts:
+//! TensorBoard then drops what earlier files say from there on, as metrics.jsonl drops those lines. Files are numbered, not
+//! named by the clock, because TensorBoard reads them in the order of their names.
+//!
+//! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
+
+use prost::Message;
+use serde_json::Value;
+use std::fs::{File, OpenOptions};
+use std::io::{Error, ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Folder of the event files in a run folder.
+pub const FOLDER: &str = "tensorboard";
+
+/// What the names of the files begin with.
+const PREFIX: &str = "events.out.tfevents.";
+
+/// The part of tensorflow.Event that is written.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(oneof = "What", tags = "3, 5, 7")]
+    what: Option<What>,
+}
+
+#[derive(Clone, PartialEq, prost::Oneof)]
+enum What {
+    #[prost(string, tag = "3")]
+    FileVersion(String),
+    #[prost(message, tag = "5")]
+    Summary(Summary),
+    #[prost(message, tag = "7")]
+    SessionLog(SessionLog),
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    values: Vec<Scalar>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Scalar {
+    #[prost(string, tag = "1")]
+    tag: String,
+    /// Optional: it is one of several kinds of value, so that zero is written too.
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionLog {
+    /// 1 is START.
+    #[prost(int32, tag = "1")]
+    status: i32,
+}
+
+/// Writes event files. What goes wrong is logged once and ends the writing: training goes on.
+#[derive(Debug)]
+pub struct EventFile {
+    state: State,
+}
+
+#[derive(Debug)]
+enum State {
+    /// Writes nowhere.
+    Off,
+    /// Nothing to write yet. A run that begins, or that continues behind so many steps.
+    Waiting(PathBuf, Option<u64>),
+    Open(File, PathBuf),
+}
+
+impl EventFile {
+    /// Writes nowhere.
+    pub fn none() -> Self {
+        Self { state: State::Off }
+    }
+
+    /// In a run folder; `resumed` is the number of steps that the run continues from. The file appears with the first line.
+    pub fn new(folder: &Path, resumed: Option<u64>) -> Self {
+        Self { state: State::Waiting(folder.join(FOLDER), resumed) }
+    }
+
+    /// Takes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
+    pub fn append(&mut self, line: &str, step: u64) {
+        if let Err((path, error)) = self.write(line, step) {
+            tracing::warn!(path = %path.display(), %error, "no more TensorBoard events will be written");
+            self.state = State::Off;
+        }
+    }
+
+    fn write(&mut self, line: &str, step: u64) -> Result<(), (PathBuf, Error)> {
+        if let State::Waiting(folder, resumed) = &self.state {
+            let (file, path) = open(folder, *resumed).map_err(|error| (folder.clone(), error))?;
+            self.state = State::Open(file, path);
+        }
+        let State::Open(file, path) = &mut self.state else { return Ok(()) };
+        let mut values = Vec::new();
+        if let Ok(line) = serde_json::from_str(line) {
+            scalars("", &line, &mut values);
+        }
+        let record = record(step, What::Summary(Summary { values }));
+        // In one piece: a reader that comes meanwhile finds whole records.
+        file.write_all(&record).map_err(|error| (path.clone(), error))
+    }
+}
+
+/// A new file behind all that are there, with what every file begins with.
+fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
+    std::fs::create_dir_all(folder)?;
+    let number = |name: &str| name.strip_prefix(PREFIX)?.parse::<u32>().ok();
+    let names = std::fs::read_dir(folder)?.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let mut next = names.filter_map(|name| number(&name)).max().unwrap_or(0);
+    let (mut file, path) = loop {
+        next = next.checked_add(1).ok_or(ErrorKind::AlreadyExists)?;
+        let path = folder.join(format!("{PREFIX}{next:04}"));
+        match OpenOptions::new().append(true).create_new(true).open(&path) {
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            other => break (other?, path),
+        }
+    };
+    let mut head = record(0, What::FileVersion("brain.Event:2".to_owned()));
+    if let Some(steps) = resumed {
+        head.extend(record(steps + 1, What::SessionLog(SessionLog { status: 1 })));
+    }
+    file.write_all(&head)?;
+    Ok((file, path))
+}
+
+/// The numbers of an object: those at its top under `run/`, the others under the name of their object.
+fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
+    let Value::Object(fields) = value else { return };
+    for (name, value) in fields {
+        match value {
+            Value::Number(number) => {
+                let group = if group.is_empty() { "run" } else { group };
+                let value = number.as_f64().map(|x| x as f32);
+                out.push(Scalar { tag: format!("{group}/{name}"), simple_value: value });
+            }
+            Value::Object(_) if group.is_empty() => scalars(name, value, out),
+            Value::Object(_) => scalars(&format!("{group}/{name}"), value, out),
+            _ => {}
+        }
+    }
+}
+
+fn record(step: u64, what: What) -> Vec<u8> {
+    #[allow(clippy::disallowed_methods, reason = "what a person reads in TensorBoard; no number of a run")]
+    let wall_time = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
+    let event = Event { wall_time, step: step as i64, what: Some(what) }.encode_to_vec();
+    let length = (event.len() as u64).to_le_bytes();
+    [&length[..], &masked(&length), &event, &masked(&event)].concat()
+}
+
+/// TensorFlow's mask: a checksum of data that has checksums in it would be weak.
+fn masked(bytes: &[u8]) -> [u8; 4] {
+    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
+}
+
+#[cfg(test)]
+mod tests;
