@@ -103,6 +103,8 @@ pub(crate) struct Shared {
     watchers: Arc<Semaphore>,
     /// Processes that were sent away. Whoever starts anew has another number.
     sent_away: Mutex<VecDeque<u64>>,
+    /// Held while it is decided who goes and who stays.
+    leaving: Mutex<()>,
     started: Instant,
     sessions: AtomicU64,
     ledger: Mutex<Ledger>,
@@ -140,6 +142,7 @@ impl Shared {
             decoders: Semaphore::new(magex_runtime::process::processors()),
             watchers,
             sent_away: Mutex::default(),
+            leaving: Mutex::default(),
             started: Instant::now(),
             sessions: AtomicU64::new(0),
             ledger: Mutex::new(Ledger::new(first_lease)),
@@ -165,9 +168,11 @@ impl Shared {
         })
     }
 
-    /// The processes of the actors that are here.
+    /// The processes of the actors that are here, without those that were told to go.
     pub(crate) fn present(&self) -> Vec<u64> {
-        lock(&self.actors).values().map(|actor| actor.incarnation).collect()
+        let actors = lock(&self.actors);
+        let sent_away = lock(&self.sent_away);
+        actors.values().map(|actor| actor.incarnation).filter(|process| !sent_away.contains(process)).collect()
     }
 
     /// Keeps a process away whose results are not usable, or that has none.
@@ -177,6 +182,17 @@ impl Shared {
         if sent_away.len() > SENT_AWAY {
             sent_away.pop_front();
         }
+    }
+
+    /// [`Self::send_away`], unless nobody else is here. Whoever is told to go counts no more from that moment on, not only
+    /// from when its connection has ended: of several that are as useless as each other, one stays.
+    pub(crate) fn send_away_if_others_stay(&self, incarnation: u64) -> bool {
+        let _one_at_a_time = lock(&self.leaving);
+        let others = self.present().iter().any(|process| *process != incarnation);
+        if others {
+            self.send_away(incarnation);
+        }
+        others
     }
 
     pub(crate) fn was_sent_away(&self, incarnation: u64) -> bool {

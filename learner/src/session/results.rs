@@ -43,10 +43,9 @@ impl Session {
             return Ok(());
         }
         self.failed += 1;
-        if self.failed < MAX_FAILURES || present.iter().all(|process| *process == self.incarnation) {
+        if self.failed < MAX_FAILURES || !self.shared.send_away_if_others_stay(self.incarnation) {
             return Ok(());
         }
-        self.shared.send_away(self.incarnation);
         let quoted: String = reason.chars().take(QUOTED).collect();
         let problem = format!("{quoted} ({} shards in a row could not be done here)", self.failed);
         Err(End::Refused(status::invalid_argument("failed", problem)))

@@ -172,10 +172,18 @@ impl Learner {
         self.finish().await
     }
 
-    /// Waits for the open plan without blocking the runtime.
+    /// Waits for the open plan without blocking the runtime. A thread that waits cannot be told that it waits in vain;
+    /// the learner can.
     pub(crate) async fn finish(&mut self) -> Result<Vec<ShardResult>, CollectError> {
-        let collector = &mut self.collector;
-        within(async { tokio::task::block_in_place(|| collector.wait()) }).await
+        let shutdown = self.shutdown.clone();
+        let patience = tokio::spawn(async move {
+            tokio::time::sleep(PATIENCE).await;
+            shutdown.cancel();
+        });
+        let result = tokio::task::block_in_place(|| self.collector.wait());
+        assert!(!patience.is_finished(), "this should have happened long ago: {result:?}");
+        patience.abort();
+        result
     }
 
     pub(crate) fn ledger(&self) -> v1::LedgerStatus {
