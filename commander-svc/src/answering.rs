@@ -79,7 +79,7 @@ impl Clock {
     }
 
     /// How long the learned scheduler may take: half of what is left, so that the exact one has the rest.
-    fn learned(&self) -> Duration {
+    pub(crate) fn learned(&self) -> Duration {
         let left = self.until.saturating_duration_since(Instant::now()) / 2;
         if self.own { left } else { left.min(LEARNED_PATIENCE) }
     }

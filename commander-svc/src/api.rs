@@ -112,13 +112,15 @@ impl CommanderService for CommanderApi {
 
     async fn create_mission(&self, request: Request<v1::CreateMissionRequest>) -> Answer<v1::CreateMissionResponse> {
         let caller = caller(&request, CLIENT)?;
-        let assignment = Some(self.keeper.create(caller, request.into_inner()).await?);
+        let clock = Clock::start(metadata::deadline(request.metadata()));
+        let assignment = Some(self.keeper.create(caller, request.into_inner(), clock).await?);
         Ok(Response::new(v1::CreateMissionResponse { assignment }))
     }
 
     async fn update_mission(&self, request: Request<v1::UpdateMissionRequest>) -> Answer<v1::UpdateMissionResponse> {
         let caller = caller(&request, CLIENT)?;
-        let assignment = Some(self.keeper.update(caller, request.into_inner()).await?);
+        let clock = Clock::start(metadata::deadline(request.metadata()));
+        let assignment = Some(self.keeper.update(caller, request.into_inner(), clock).await?);
         Ok(Response::new(v1::UpdateMissionResponse { assignment }))
     }
 

@@ -1,6 +1,6 @@
 //! Missions behind the API: planned on threads of their own, kept, and told to whoever watches.
 
-use crate::answering::{Answering, refusal};
+use crate::answering::{Answering, Clock, refusal};
 use crate::batch::Gone;
 use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
 use crate::training::{Episode, Training, TrainingShard};
@@ -13,14 +13,12 @@ use magex_runtime::backoff::incarnation;
 use magex_runtime::status;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use tokio::sync::broadcast;
 use tonic::Status;
 
 /// Events that a slow watcher may fall behind before it gets everything anew.
 const BACKLOG: usize = 64;
-/// How long planning a mission may take.
-const PATIENCE: Duration = Duration::from_secs(30);
 /// How often an update is planned again because the mission changed meanwhile.
 const ATTEMPTS: u32 = 16;
 /// When to come back to a service that keeps as many missions as it may.
@@ -68,11 +66,12 @@ impl Keeper {
         self: &Arc<Self>,
         caller: Caller,
         request: v1::CreateMissionRequest,
+        clock: Clock,
     ) -> Result<v1::Assignment, Status> {
         let cells = self.cells((0, 0), (request.agents.len(), request.goals.len()), learned(request.scheduler));
-        let (own, places) = (self.clone(), self.answering.places(cells, PATIENCE).await?);
+        let (own, places) = (self.clone(), self.answering.places(cells, clock.left()).await?);
         let gone = Gone::default();
-        let waits = Waits::from(&gone);
+        let waits = Waits::from(&gone, clock);
         blocking(move || {
             let _held = places;
             own.missions.check_room(&caller.name).map_err(kept)?;
@@ -90,14 +89,15 @@ impl Keeper {
         self: &Arc<Self>,
         caller: Caller,
         request: v1::UpdateMissionRequest,
+        clock: Clock,
     ) -> Result<v1::Assignment, Status> {
         let gone = Gone::default();
         for _ in 1..ATTEMPTS {
-            if let Some(assignment) = self.try_update(&caller, &request, Waits::from(&gone), false).await? {
+            if let Some(assignment) = self.try_update(&caller, &request, Waits::from(&gone, clock), false).await? {
                 return Ok(assignment);
             }
         }
-        let last = self.try_update(&caller, &request, Waits::from(&gone), true).await?;
+        let last = self.try_update(&caller, &request, Waits::from(&gone, clock), true).await?;
         last.ok_or_else(|| Status::aborted("the mission grows faster than it is planned; send fewer updates at a time"))
     }
 
@@ -111,7 +111,7 @@ impl Keeper {
     ) -> Result<Option<v1::Assignment>, Status> {
         let mission = self.writable(caller, &request.mission_id)?;
         let most = self.most_cells(&mission, request);
-        let (own, places) = (self.clone(), self.answering.places(most, PATIENCE).await?);
+        let (own, places) = (self.clone(), self.answering.places(most, waits.clock.left()).await?);
         let (caller, request) = (caller.clone(), request.clone());
         blocking(move || {
             let _held = places;
@@ -271,7 +271,7 @@ impl Keeper {
     }
 
     fn plan(&self, problem: &Problem, waits: &Waits) -> Result<Planned, DispatchError> {
-        self.answering.plan_here(problem, PATIENCE, &|| waits.go_on())
+        self.answering.plan_here(problem, waits.clock.learned(), &|| waits.go_on())
     }
 
     /// A mission that this caller may change.
@@ -311,16 +311,16 @@ impl Keeper {
 /// Whether somebody still waits for a plan: the caller's call is dropped when it hangs up and when its deadline is over.
 struct Waits {
     gone: Arc<AtomicBool>,
-    start: Instant,
+    clock: Clock,
 }
 
 impl Waits {
-    fn from(gone: &Gone) -> Self {
-        Self { gone: gone.0.clone(), start: Instant::now() }
+    fn from(gone: &Gone, clock: Clock) -> Self {
+        Self { gone: gone.0.clone(), clock }
     }
 
     fn go_on(&self) -> bool {
-        !self.gone.load(Ordering::Relaxed) && self.start.elapsed() < PATIENCE
+        !self.gone.load(Ordering::Relaxed) && !self.clock.over()
     }
 
     /// Before something is written: who was told that there was no answer finds nothing changed.

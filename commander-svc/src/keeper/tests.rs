@@ -29,10 +29,14 @@ fn request(id: &str, agents: usize, goals: usize) -> v1::CreateMissionRequest {
     v1::CreateMissionRequest { mission_id: id.into(), agents, goals, ..Default::default() }
 }
 
+fn clock() -> Clock {
+    Clock::start(None)
+}
+
 async fn all_processors(keeper: &Keeper) -> Vec<crate::answering::Places> {
     let mut taken = Vec::new();
     while keeper.answering.free_processors() > 0 {
-        taken.push(keeper.answering.places(1, PATIENCE).await.unwrap());
+        taken.push(keeper.answering.places(1, clock().left()).await.unwrap());
     }
     taken
 }
@@ -41,25 +45,25 @@ async fn all_processors(keeper: &Keeper) -> Vec<crate::answering::Places> {
 async fn the_smallest_mission_waits_for_a_processor_like_everybody() {
     let keeper = keeper();
     let (me, tiny) = (client("me"), request("m", 1, 1));
-    keeper.create(me.clone(), tiny.clone()).await.unwrap();
+    keeper.create(me.clone(), tiny.clone(), clock()).await.unwrap();
     let taken = all_processors(&keeper).await;
     let update = v1::UpdateMissionRequest { mission_id: "m".into(), ..Default::default() };
     let (created, updated) = tokio::join!(
-        keeper.create(me.clone(), v1::CreateMissionRequest { mission_id: "n".into(), ..tiny }),
-        keeper.update(me.clone(), update.clone())
+        keeper.create(me.clone(), v1::CreateMissionRequest { mission_id: "n".into(), ..tiny }, clock()),
+        keeper.update(me.clone(), update.clone(), clock())
     );
     assert_eq!(
         (created.unwrap_err().code(), updated.unwrap_err().code()),
         (Code::ResourceExhausted, Code::ResourceExhausted)
     );
     drop(taken);
-    assert_eq!(keeper.update(me, update).await.unwrap().revision, 2);
+    assert_eq!(keeper.update(me, update, clock()).await.unwrap().revision, 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
     let keeper = keeper();
-    keeper.create(client("me"), request("old", 1, 1)).await.unwrap();
+    keeper.create(client("me"), request("old", 1, 1), clock()).await.unwrap();
     let processors = keeper.answering.free_processors();
     let large = request("new", 1000, 1000);
     let update = v1::UpdateMissionRequest {
@@ -69,7 +73,7 @@ async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
         ..Default::default()
     };
     let calls: [std::pin::Pin<Box<dyn Future<Output = _> + Send>>; 2] =
-        [Box::pin(keeper.create(client("me"), large)), Box::pin(keeper.update(client("me"), update))];
+        [Box::pin(keeper.create(client("me"), large, clock())), Box::pin(keeper.update(client("me"), update, clock()))];
     for mut call in calls {
         // The work is on its thread; then the caller hangs up, or its deadline is over.
         assert!(call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending());
@@ -85,7 +89,7 @@ async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
 #[tokio::test]
 async fn strangers_cannot_tell_a_mission_of_somebody_else_from_none() {
     let keeper = keeper();
-    keeper.create(client("me"), request("mine", 1, 1)).await.unwrap();
+    keeper.create(client("me"), request("mine", 1, 1), clock()).await.unwrap();
     let you = client("you");
     // Also while no processor is free.
     let _taken = all_processors(&keeper).await;
@@ -96,7 +100,7 @@ async fn strangers_cannot_tell_a_mission_of_somebody_else_from_none() {
     for id in ["mine", "none"] {
         assert_eq!(said(keeper.get(&you, id).unwrap_err(), id), none);
         assert_eq!(said(keeper.delete(you.clone(), id.into()).await.unwrap_err(), id), none);
-        assert_eq!(said(keeper.update(you.clone(), update(id)).await.unwrap_err(), id), none);
+        assert_eq!(said(keeper.update(you.clone(), update(id), clock()).await.unwrap_err(), id), none);
     }
     keeper.delete(client("me"), "mine".into()).await.unwrap();
     assert_eq!(keeper.count(), 0);
