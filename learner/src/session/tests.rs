@@ -21,8 +21,17 @@ fn shared(lease: Duration) -> Arc<Shared> {
 
 /// An actor that has been greeted, and what it will hear.
 fn session(shared: &Arc<Shared>) -> (Session, mpsc::Receiver<Result<v1::RolloutResponse, Status>>) {
+    session_of(shared, "a", 0)
+}
+
+fn session_of(
+    shared: &Arc<Shared>,
+    name: &str,
+    incarnation: u64,
+) -> (Session, mpsc::Receiver<Result<v1::RolloutResponse, Status>>) {
     let (outbound, heard) = mpsc::channel(4096);
-    let hello = v1::Hello { protocol_version: PROTOCOL_VERSION, actor_id: "a".into(), ..Default::default() };
+    let protocol_version = PROTOCOL_VERSION;
+    let hello = v1::Hello { protocol_version, actor_id: name.into(), incarnation, ..Default::default() };
     let first = v1::RolloutRequest { message: Some(Request::Hello(hello)) };
     let (id, hello) = greet(shared, "here".into(), first, &outbound).unwrap();
     (Session::new(shared.clone(), id, hello, outbound), heard)
@@ -112,4 +121,32 @@ async fn a_damaged_result_takes_its_lease_with_it() {
     let message = v1::ResultPart { lease_id: lease, part: Some(part), timing: None };
     session.hear(Request::Part(message)).await.unwrap();
     assert_eq!((session.damaged, session.handed.len()), (1, 0));
+}
+
+/// Leases a shard and gives it back for good; whether it may stay.
+fn fail(session: &mut Session) -> bool {
+    let lease = session.shared.with_ledger(|ledger| ledger.lease(session.id)).unwrap();
+    let failed = v1::Failed { lease_id: lease.id.0, reason: "no luck".into(), ..Default::default() };
+    session.take_back(&failed).is_ok()
+}
+
+#[tokio::test]
+async fn of_several_that_can_do_nothing_one_stays_and_finds_the_shard_that_nobody_can_do() {
+    let shared = shared(Duration::from_secs(15));
+    publish(&shared);
+    shared.open(plan(3)).unwrap();
+    let (mut a, _a) = session_of(&shared, "a", 1);
+    let (mut b, _b) = session_of(&shared, "b", 2);
+    for _ in 0..2 {
+        assert!(fail(&mut a) && fail(&mut b));
+    }
+    // The connection of whoever is told to go has not ended yet, and both fail at once.
+    let stays = (fail(&mut a), fail(&mut b));
+    assert_eq!(stays, (false, true));
+    assert_eq!(shared.present(), [2]);
+    for _ in 0..3 {
+        assert!(fail(&mut b), "the last one is not sent away");
+    }
+    let error = shared.wait().unwrap_err();
+    assert!(error.to_string().contains("no luck"), "{error}");
 }
