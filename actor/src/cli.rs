@@ -72,6 +72,7 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
         return Ok(exit::OK);
     }
     let config = configure(&args)?;
+    process::refuse_huge_pages();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .thread_name("magex-net")

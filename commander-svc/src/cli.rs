@@ -140,6 +140,7 @@ pub fn run(args: CommanderArgs) -> Result<u8, Failure> {
     }
     let config = args.config()?;
     process::allow_open_files();
+    process::refuse_huge_pages();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("magex-net")

@@ -104,6 +104,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     let security = args.security.read(&args.listen)?;
     process::allow_open_files();
+    process::refuse_huge_pages();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("magex-net")

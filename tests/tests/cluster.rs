@@ -49,6 +49,17 @@ fn every_task_learns_the_same_bits_with_one_actor_two_actors_and_in_one_process(
 }
 
 #[test]
+fn no_service_takes_huge_pages() {
+    let mut cluster = Cluster::start(&small(ExecutorKind::Magex, 5, 40));
+    cluster.start_actor();
+    wait_for(&cluster, 1);
+    for process in [&cluster.learner, cluster.commander.as_ref().unwrap(), &cluster.actors[0]] {
+        // The allocator would ask for them: an hour later the process would be larger by half.
+        assert_eq!(process.told("THP_enabled"), "0", "{}", process.log());
+    }
+}
+
+#[test]
 fn an_actor_that_is_killed_and_replaced_changes_nothing() {
     let config = long();
     let mut cluster = Cluster::start(&config);

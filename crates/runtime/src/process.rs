@@ -73,6 +73,15 @@ pub fn allow_open_files() {
     }
 }
 
+/// Keeps a service to pages of the ordinary size, so that it holds what it uses. The allocator asks for huge pages, and the
+/// kernel then fills 2 MiB wherever one page of them is in use, some of them hours later: memory that grows and is no leak.
+pub fn refuse_huge_pages() {
+    // A kernel without huge pages has none to refuse.
+    if let Err(error) = rustix::thread::disable_transparent_huge_pages(true) {
+        tracing::debug!(%error, "huge pages stay as they are");
+    }
+}
+
 /// The processors that this process may use.
 pub fn processors() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
