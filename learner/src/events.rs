@@ -12,10 +12,10 @@ use tonic::Status;
 
 /// Events that are kept for late watchers. A line of metrics is some kilobytes: more would be a slow leak for the first hours
 /// of a run; metrics.jsonl has them all.
-const KEPT: usize = 1000;
+const KEPT: usize = 256;
 
 /// Events that are copied at a time, so that the log is never locked for long.
-const BATCH: usize = 256;
+const BATCH: usize = 64;
 
 #[derive(Debug, Default)]
 struct Log {

@@ -367,7 +367,9 @@ impl Trainer {
             updates,
             wall_s,
         );
-        let line = self.metrics.append(&metrics)?;
+        let mut line = self.metrics.append(&metrics)?;
+        // It is kept for late watchers; the buffer it was written into is larger.
+        line.shrink_to_fit();
         collector.measured(&metrics);
         self.events.append(&line, metrics.joint_env_steps);
         self.tell(|page| page.line(&line));

@@ -89,6 +89,14 @@ impl Process {
         value.unwrap_or_else(|| panic!("no {name} in {status}")).trim().to_owned()
     }
 
+    /// Whether its environment has a variable of this name.
+    pub fn has_variable(&self, name: &str) -> bool {
+        let environment = std::fs::read(format!("/proc/{}/environ", self.child.id())).expect("the process runs");
+        environment
+            .split(|byte| *byte == 0)
+            .any(|line| line.split(|byte| *byte == b'=').next() == Some(name.as_bytes()))
+    }
+
     /// SIGKILL.
     pub fn kill(&mut self) {
         self.child.kill().expect("the process can be killed");

@@ -49,13 +49,16 @@ fn every_task_learns_the_same_bits_with_one_actor_two_actors_and_in_one_process(
 }
 
 #[test]
-fn no_service_takes_huge_pages() {
+fn every_service_has_the_memory_settings_that_it_needs() {
     let mut cluster = Cluster::start(&small(ExecutorKind::Magex, 5, 40));
     cluster.start_actor();
     wait_for(&cluster, 1);
     for process in [&cluster.learner, cluster.commander.as_ref().unwrap(), &cluster.actors[0]] {
-        // The allocator would ask for them: an hour later the process would be larger by half.
+        // With huge pages it would be larger by half, an hour later.
         assert_eq!(process.told("THP_enabled"), "0", "{}", process.log());
+        for name in ["MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "CANDLE_NUM_THREADS", "RAYON_NUM_THREADS"] {
+            assert!(process.has_variable(name), "{name}: {}", process.log());
+        }
     }
 }
 

@@ -5,13 +5,23 @@ use std::net::SocketAddr;
 use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
-/// The tensor library must not start threads of its own: it reads these before anything else runs.
-const SINGLE_THREADED: [(&str, &str); 2] = [("RAYON_NUM_THREADS", "1"), ("CANDLE_NUM_THREADS", "1")];
+/// What the C library and the tensor library read of the environment before anything else runs.
+const ENVIRONMENT: [(&str, &str); 4] = [
+    // The tensor library must not start threads of its own.
+    ("RAYON_NUM_THREADS", "1"),
+    ("CANDLE_NUM_THREADS", "1"),
+    // Blocks of up to 32 MiB come from the heap, and the heap keeps up to 64 MiB that are free at its end. It is where glibc's
+    // own rule for these two ends with bigger blocks. With smaller ones, as ours are, each step of training gives its buffers
+    // back to the system and fetches them again: three times slower.
+    ("MALLOC_MMAP_THRESHOLD_", "33554432"),
+    ("MALLOC_TRIM_THRESHOLD_", "67108864"),
+];
 
-/// The command that runs this process again with single-threaded tensor kernels, or `None` when it already has them.
-/// `main` replaces itself with it (`CommandExt::exec`) before starting any thread.
-pub fn single_threaded_math() -> std::io::Result<Option<Command>> {
-    if SINGLE_THREADED.iter().all(|(name, _)| std::env::var_os(name).is_some()) {
+/// The command that runs this process again in the environment that it needs, or `None` when it has it already. What is set
+/// stays as it is.
+fn in_its_environment() -> std::io::Result<Option<Command>> {
+    let missing = || ENVIRONMENT.iter().filter(|(name, _)| std::env::var_os(name).is_none());
+    if missing().next().is_none() {
         return Ok(None);
     }
     let mut command = Command::new(std::env::current_exe()?);
@@ -20,18 +30,14 @@ pub fn single_threaded_math() -> std::io::Result<Option<Command>> {
         // The name by which it was called may say what it shall do.
         command.arg0(name);
     }
-    command.args(arguments);
-    for (name, value) in SINGLE_THREADED {
-        if std::env::var_os(name).is_none() {
-            command.env(name, value);
-        }
-    }
+    command.args(arguments).envs(missing().copied());
     Ok(Some(command))
 }
 
-/// Replaces this process with one whose tensor kernels are single-threaded, unless it is such a process already.
-pub fn ensure_single_threaded_math() -> std::io::Result<()> {
-    match single_threaded_math()? {
+/// Replaces this process with one that has the environment it needs (single-threaded tensor kernels, an allocator that keeps
+/// its buffers), unless it is such a process already. `main` does this before it starts a thread.
+pub fn ensure_environment() -> std::io::Result<()> {
+    match in_its_environment()? {
         Some(mut command) => Err(command.exec()),
         None => Ok(()),
     }
@@ -73,8 +79,9 @@ pub fn allow_open_files() {
     }
 }
 
-/// Keeps a service to pages of the ordinary size, so that it holds what it uses. The allocator asks for huge pages, and the
-/// kernel then fills 2 MiB wherever one page of them is in use, some of them hours later: memory that grows and is no leak.
+/// Keeps a service to pages of the ordinary size, so that it holds what it uses. With huge ones, which some systems give
+/// unasked, the kernel fills 2 MiB wherever one page of them is in use, some of them hours later: memory that grows and is no
+/// leak.
 pub fn refuse_huge_pages() {
     // A kernel without huge pages has none to refuse.
     if let Err(error) = rustix::thread::disable_transparent_huge_pages(true) {

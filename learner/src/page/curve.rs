@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 /// Rows that are kept: beyond it, every other one goes. A drawn curve has fewer pixels.
-const KEPT: usize = 4096;
+const KEPT: usize = 2048;
 
 /// Name of a column and where it is in a line.
 const COLUMNS: [(&str, &str); 26] = [
