@@ -56,7 +56,8 @@ fn every_service_has_the_memory_settings_that_it_needs() {
     for process in [&cluster.learner, cluster.commander.as_ref().unwrap(), &cluster.actors[0]] {
         // With huge pages it would be larger by half, an hour later.
         assert_eq!(process.told("THP_enabled"), "0", "{}", process.log());
-        for name in ["MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "CANDLE_NUM_THREADS", "RAYON_NUM_THREADS"] {
+        let memory = ["MALLOC_ARENA_MAX", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"];
+        for name in memory.into_iter().chain(["CANDLE_NUM_THREADS", "RAYON_NUM_THREADS"]) {
             assert!(process.has_variable(name), "{name}: {}", process.log());
         }
     }

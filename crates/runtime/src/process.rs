@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
-/// What the C library and the tensor library read of the environment before anything else runs.
+/// What the C library and the tensor library read of the environment before anything else runs, but for [`ARENAS`].
 const ENVIRONMENT: [(&str, &str); 4] = [
     // The tensor library must not start threads of its own.
     ("RAYON_NUM_THREADS", "1"),
@@ -17,10 +17,18 @@ const ENVIRONMENT: [(&str, &str); 4] = [
     ("MALLOC_TRIM_THRESHOLD_", "67108864"),
 ];
 
+/// Heaps among which glibc's allocator spreads the threads. It takes eight for each processor, and each keeps what its
+/// busiest moment needed: with one for each, a learner of 200 actors holds a third less and is no slower.
+const ARENAS: &str = "MALLOC_ARENA_MAX";
+
 /// The command that runs this process again in the environment that it needs, or `None` when it has it already. What is set
 /// stays as it is.
 fn in_its_environment() -> std::io::Result<Option<Command>> {
-    let missing = || ENVIRONMENT.iter().filter(|(name, _)| std::env::var_os(name).is_none());
+    let arenas = processors().to_string();
+    let missing = || {
+        let needed = ENVIRONMENT.into_iter().chain([(ARENAS, arenas.as_str())]);
+        needed.filter(|(name, _)| std::env::var_os(name).is_none())
+    };
     if missing().next().is_none() {
         return Ok(None);
     }
@@ -30,7 +38,7 @@ fn in_its_environment() -> std::io::Result<Option<Command>> {
         // The name by which it was called may say what it shall do.
         command.arg0(name);
     }
-    command.args(arguments).envs(missing().copied());
+    command.args(arguments).envs(missing());
     Ok(Some(command))
 }
 
