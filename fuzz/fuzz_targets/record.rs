@@ -1,8 +1,6 @@
 //! The record of a mission on disk. See fuzz/run.
 #![no_main]
 
-#[path = "../../tests/src/decoders/dispatch.rs"]
-#[allow(dead_code)]
-mod dispatch;
+use magex_tests::decoders::dispatch;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| dispatch::record(bytes));

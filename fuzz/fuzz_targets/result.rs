@@ -1,8 +1,6 @@
 //! The result of a shard. See fuzz/run.
 #![no_main]
 
-#[path = "../../tests/src/decoders/wire.rs"]
-#[allow(dead_code)]
-mod wire;
+use magex_tests::decoders::wire;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| wire::result(bytes));

@@ -156,10 +156,8 @@ fn trajectory(run: &Run) -> ShardResult {
 fn trajectories_parts_and_weights() {
     let damaged = Run::default();
     let good = encode_result(&RunId("r".into()), "sha", &trajectory(&damaged));
-    run("result", vec![good.to_vec()], 100_000, |bytes| {
-        wire::result(bytes);
-        damaged.admit(bytes);
-    });
+    run("result", vec![good.to_vec()], 100_000, wire::result);
+    run("admission", vec![good.to_vec()], 100_000, |bytes| damaged.admit(bytes));
     let part = |data: &[u8], index, total, total_bytes| {
         let crc32c = parts::split(data.to_vec().into()).next().unwrap().crc32c;
         v1::Part { index, total, total_bytes, crc32c, data: data.to_vec().into() }.encode_to_vec()
