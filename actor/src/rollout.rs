@@ -113,7 +113,7 @@ impl Roller {
 
         let mut out = columns(&shape, shard, keep);
         let mut recording = (Vec::new(), Vec::new());
-        let mut actions = vec![0u8; b * n * shape.heads];
+        let mut actions = vec![0u8; b * n * shape.action_components];
         let (mut log_probs, mut rewards) = (vec![0.0; b * n], vec![0.0; b * n]);
         let mut policy = Policy::new(self, shard, b, &keys.iter().map(|k| k.graph).collect::<Vec<_>>());
         let mut streams: Vec<Stream> = keys.iter().map(|k| k.action.stream()).collect();
@@ -122,10 +122,10 @@ impl Roller {
             if keep {
                 out.positions.extend_from_slice(&state.positions);
                 out.velocities.extend_from_slice(&state.velocities);
-                out.extras.extend_from_slice(&state.extras);
+                out.agent_state.extend_from_slice(&state.agent_state);
             } else if shard.record {
                 recording.0.extend_from_slice(&state.positions[..shape.bodies * shape.dims]);
-                recording.1.extend_from_slice(&state.extras[..n * shape.extras]);
+                recording.1.extend_from_slice(&state.agent_state[..n * shape.agent_state]);
             }
             if step == steps {
                 break;
@@ -144,7 +144,7 @@ impl Roller {
                         log_probs[row] = self.heads.choose(
                             &logits[row * width..(row + 1) * width],
                             stream,
-                            &mut actions[row * shape.heads..(row + 1) * shape.heads],
+                            &mut actions[row * shape.action_components..(row + 1) * shape.action_components],
                         );
                     }
                     symmetries = features.symmetries;
@@ -155,21 +155,21 @@ impl Roller {
                 out.actions.extend_from_slice(&actions);
             }
             // The policy chose in each agent's own frame.
-            to_world(task.action_code(), shape.heads, &symmetries, &mut actions);
+            to_world(task.action_code(), shape.action_components, &symmetries, &mut actions);
             worlds.step(&actions, &mut rewards)?;
             if keep {
                 out.log_probs.extend_from_slice(&log_probs);
                 out.rewards.extend_from_slice(&rewards);
             }
         }
-        let metrics = metrics(worlds.as_ref(), &reply, shape.targets);
+        let metrics = metrics(worlds.as_ref(), &reply, shape.goals_per_agent);
         if !keep {
             let recording = shard.record.then(|| Recording {
                 shape: Shape { episodes: 1, ..shape },
                 positions: recording.0,
-                extras: recording.1,
+                agent_state: recording.1,
                 landmarks: state.landmarks[..shape.landmarks * shape.dims].to_vec(),
-                goals: state.goals[..n * shape.targets].to_vec(),
+                goals: state.goals[..n * shape.goals_per_agent].to_vec(),
             });
             return Ok(ShardResult::Eval(EvalOutcome { shard: *shard, metrics, recording }));
         }
@@ -187,7 +187,7 @@ impl Roller {
 struct JointState {
     positions: Vec<f32>,
     velocities: Vec<f32>,
-    extras: Vec<f32>,
+    agent_state: Vec<f32>,
     landmarks: Vec<f32>,
     goals: Vec<u32>,
 }
@@ -198,7 +198,7 @@ impl JointState {
         Self {
             positions: vec![0.0; state],
             velocities: vec![0.0; state],
-            extras: vec![0.0; shape.episodes * shape.agents * shape.extras],
+            agent_state: vec![0.0; shape.episodes * shape.agents * shape.agent_state],
             landmarks: landmarks.to_vec(),
             goals: Vec::new(),
         }
@@ -207,14 +207,14 @@ impl JointState {
     fn read(&mut self, worlds: &dyn Env) -> Result<(), EnvError> {
         worlds.write_positions(&mut self.positions)?;
         worlds.write_velocities(&mut self.velocities)?;
-        worlds.write_extras(&mut self.extras)
+        worlds.write_agent_state(&mut self.agent_state)
     }
 
     fn joint_states(&self) -> JointStates<'_> {
         JointStates {
             positions: &self.positions,
             velocities: &self.velocities,
-            extras: &self.extras,
+            agent_state: &self.agent_state,
             landmarks: &self.landmarks,
             goals: &self.goals,
         }
@@ -224,7 +224,7 @@ impl JointState {
         View {
             positions: &self.positions,
             velocities: &self.velocities,
-            extras: &self.extras,
+            agent_state: &self.agent_state,
             landmarks: &self.landmarks,
             goals: &self.goals,
         }
@@ -264,7 +264,7 @@ impl JointState {
 
 /// [B, K, N] assignments, stage by stage, to the [B, N, K] goals that each agent finds by following them.
 fn chain(shape: &Shape, assigned: &[u32]) -> Vec<u32> {
-    let (n, k) = (shape.agents, shape.targets);
+    let (n, k) = (shape.agents, shape.goals_per_agent);
     let mut goals = Vec::with_capacity(assigned.len());
     for episode in assigned.chunks_exact(n * k) {
         for agent in 0..n {
@@ -315,10 +315,10 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         shape: *shape,
         positions: Vec::with_capacity(state),
         velocities: Vec::with_capacity(state),
-        extras: Vec::with_capacity(room((shape.steps + 1) * shape.episodes * shape.agents * shape.extras)),
+        agent_state: Vec::with_capacity(room((shape.steps + 1) * shape.episodes * shape.agents * shape.agent_state)),
         landmarks: Vec::new(),
         goals: Vec::new(),
-        actions: Vec::with_capacity(rows * shape.heads),
+        actions: Vec::with_capacity(rows * shape.action_components),
         log_probs: Vec::with_capacity(rows),
         rewards: Vec::with_capacity(rows),
         goal_log_probs: Vec::new(),

@@ -7,11 +7,11 @@ use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::goals::{GoalReply, GoalRequest};
 
 /// Assigns the goals of every stage of every episode of a shard. What is random is keyed by (seed, shard, episode).
-/// `random_share` of the training episodes get a random matching, whatever the scheduler.
+/// `random_assignment_fraction` of the training episodes get a random matching, whatever the scheduler.
 /// Interrupted once `go_on` says that nobody waits for it any more; it is asked before every team.
 pub fn answer(
     commander: &Commander,
-    random_share: f32,
+    random_assignment_fraction: f32,
     request: &GoalRequest,
     go_on: &dyn Fn() -> bool,
 ) -> Result<GoalReply, CommanderError> {
@@ -32,7 +32,7 @@ pub fn answer(
     };
     for e in 0..b {
         let mut stream = episode_keys(request.seed, &request.shard, e as u32).commander.stream();
-        let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_share);
+        let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_assignment_fraction);
         for stage in e * k..(e + 1) * k {
             if !go_on() {
                 return Err(CommanderError::Interrupted);

@@ -12,8 +12,8 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub struct TrainedScheduler {
     commander: Commander,
-    /// `commander.random_share` of the run.
-    random_share: f32,
+    /// `commander.random_assignment_fraction` of the run.
+    random_assignment_fraction: f32,
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
@@ -25,12 +25,15 @@ pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn S
         None => Commander::load(&config.commander, config.task.agents, config.task.dims(), weights)
             .map_err(|error| failed(error.to_string()))?,
     };
-    Ok(Arc::new(TrainedScheduler { commander, random_share: config.commander.random_share }))
+    Ok(Arc::new(TrainedScheduler {
+        commander,
+        random_assignment_fraction: config.commander.random_assignment_fraction,
+    }))
 }
 
 impl Scheduler for TrainedScheduler {
     fn assign_batch(&self, request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
-        answer(&self.commander, self.random_share, request, go_on).map_err(|error| match error {
+        answer(&self.commander, self.random_assignment_fraction, request, go_on).map_err(|error| match error {
             CommanderError::Instance(problem) => AssignError::Invalid { field: "agents".to_owned(), problem },
             CommanderError::Interrupted => AssignError::Interrupted,
             other => AssignError::Failed(other.to_string()),

@@ -1,7 +1,7 @@
 //! How long an update takes, for the command line. The clock decides nothing but the number that is reported.
 
-use crate::batch::Batch;
-use crate::mappo::Mappo;
+use crate::train::batch::Batch;
+use crate::train::mappo::Mappo;
 use crate::trainer::TrainError;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
@@ -30,8 +30,8 @@ pub struct MinibatchTime {
 pub fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<MinibatchTime, TrainError> {
     let mut config = config.clone();
     let n = config.task.agents;
-    let chunk = if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk };
-    let units = (config.mappo.minibatch / (chunk * n)).max(1);
+    let chunk = if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk_length };
+    let units = (config.mappo.minibatch_size / (chunk * n)).max(1);
     // One episode is one minibatch.
     config.task.horizon = (units * chunk) as u32;
     let trajectory = synthetic(&config, minibatches);
@@ -99,17 +99,17 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
         shape,
         positions,
         velocities,
-        extras: vec![0.0; (t + 1) * b * n * shape.extras],
+        agent_state: vec![0.0; (t + 1) * b * n * shape.agent_state],
         landmarks,
-        goals: (0..b * n).flat_map(|i| std::iter::repeat_n((i % n) as u32, shape.targets)).collect(),
+        goals: (0..b * n).flat_map(|i| std::iter::repeat_n((i % n) as u32, shape.goals_per_agent)).collect(),
         actions: (0..t * b * n)
             .flat_map(|_| choices.iter().map(|&c| stream.below(c as u32) as u8).collect::<Vec<_>>())
             .collect(),
         log_probs: vec![uniform as f32; t * b * n],
         rewards,
-        goal_log_probs: vec![0.0; b * shape.targets],
-        costs: vec![1.0; b * shape.targets],
-        exact_costs: vec![1.0; b * shape.targets],
+        goal_log_probs: vec![0.0; b * shape.goals_per_agent],
+        costs: vec![1.0; b * shape.goals_per_agent],
+        exact_costs: vec![1.0; b * shape.goals_per_agent],
         metrics: Vec::new(),
     }
 }
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn a_batch_is_whole_minibatches() {
         let mut config = RunConfig { task: TaskConfig::simple_spread(8, Spawn::Uniform), ..RunConfig::default() };
-        config.mappo.minibatch = 256;
+        config.mappo.minibatch_size = 256;
         config.executor.kind = ExecutorKind::Local;
         let time = minibatch(&config, 2, 1).unwrap();
         assert_eq!((time.samples, time.minibatches), (256, 2));

@@ -7,10 +7,10 @@
 pub mod disk;
 
 use self::disk::{Disk, FileSystem};
-use crate::adam::Adam;
-use crate::commander::CommanderState;
-use crate::gae::ValueNorm;
-use crate::mappo::ExecutorState;
+use crate::train::adam::Adam;
+use crate::train::commander_ppo::CommanderState;
+use crate::train::gae::ValueNorm;
+use crate::train::mappo::ExecutorState;
 use magex_nets::params::{ParamError, Params, from_safetensors, to_safetensors};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};

@@ -1,10 +1,11 @@
 //! The learner's command line.
 
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::ingest::Limits;
 use crate::page::{LivePage, RunInfo};
-use crate::service::{LearnerHandle, RunIdentity, learner_service};
-use crate::standing::Standing;
+use crate::run_folder::Standing;
+use crate::run_identity::RunIdentity;
+use crate::serve::service::{LearnerHandle, learner_service};
+use crate::serve::validate::Limits;
 use crate::trainer::{Outcome, Trainer};
 use clap::Args;
 use magex_core::config::RunConfig;
@@ -129,7 +130,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         seed: config.run.seed,
         lease,
     };
-    let most = (config.mappo.episodes / config.mappo.shards).max(EVAL_SHARD_LIMIT);
+    let most = (config.collect.episodes_per_iteration / config.collect.shards_per_iteration).max(EVAL_SHARD_LIMIT);
     let live = RunInfo { name: identity.name.clone(), learner: Some(address.to_string()), lease: Some(lease) };
     let (handle, mut collector) = learner_service(identity, Limits::for_task(&config.task, most as usize));
     let handle = handle.guarded(security);

@@ -49,7 +49,7 @@ pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
         shape,
         positions: vec![0.5; (t + 1) * b * n * 2],
         velocities: vec![0.1; (t + 1) * b * n * 2],
-        extras: vec![],
+        agent_state: vec![],
         landmarks: vec![0.2; b * n * 2],
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
@@ -69,7 +69,7 @@ pub(crate) fn eval_outcome(task: &TaskConfig, mut shard: Shard, record: bool) ->
     let recording = record.then(|| Recording {
         shape,
         positions: vec![0.5; (shape.steps + 1) * n * 2],
-        extras: vec![],
+        agent_state: vec![],
         landmarks: vec![0.2; n * 2],
         goals: (0..n as u32).collect(),
     });

@@ -1,29 +1,27 @@
-//! magex-learner
+//! The learner: it leases shards to actors, trains on what they return, publishes weights and keeps the run folder.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`trainer`] | the training loop: publish, collect, update, record, checkpoint |
+//! | [`train`] | the algorithms: MAPPO for the executor, PPO for the goal commander |
+//! | [`serve`] | the gRPC service: sessions, the ledger of leases, validation of results, the weights board |
+//! | [`report`] | what a run writes for people: metrics.jsonl, summary.json, event files |
+//! | [`collector`], [`run_events`] | the seam between the training loop and the service |
+//! | [`checkpoint`] | what a resume needs |
+//! | [`page`] | the live page |
+//! | [`cli`] | the command line of `magex-learner` |
 
-pub mod adam;
-pub mod batch;
 pub mod bench;
-pub mod bound;
 pub mod checkpoint;
 pub mod cli;
 pub mod collector;
-pub mod commander;
-mod events;
 #[cfg(test)]
 mod fixtures;
-pub mod gae;
-mod gauges;
-pub mod ingest;
-pub mod ledger;
-pub mod loss;
-pub mod mappo;
-pub mod metrics;
 pub mod page;
-pub mod service;
-mod session;
-mod standing;
-mod state;
-mod tally;
-pub mod tensorboard;
+pub mod report;
+pub mod run_events;
+mod run_folder;
+pub mod run_identity;
+pub mod serve;
+pub mod train;
 pub mod trainer;
-pub mod weights;

@@ -3,14 +3,15 @@
 
 mod saving;
 
-use crate::batch::Batch;
 use crate::checkpoint::{self, CheckpointError, Learned, Progress, sha256_hex};
-use crate::collector::{CollectError, Collector, IterationReport, RunEvent, StopReason};
-use crate::commander::CommanderPpo;
-use crate::mappo::Mappo;
-use crate::metrics::{EvalSummary, IterationMetrics, MetricsFile, Summary, Timing, summarise};
+use crate::collector::Collector;
 use crate::page::{LivePage, Phase};
-use crate::tensorboard::EventFile;
+use crate::report::metrics_file::{EvalSummary, IterationMetrics, MetricsFile, Summary, Timing, summarise};
+use crate::report::tensorboard::EventFile;
+use crate::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use crate::train::batch::Batch;
+use crate::train::commander_ppo::CommanderPpo;
+use crate::train::mappo::Mappo;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
@@ -315,9 +316,9 @@ impl Trainer {
 
     /// The iteration's training shards.
     fn training(&self) -> impl Iterator<Item = Shard> + use<> {
-        let m = &self.config.mappo;
-        let (episodes, iteration) = (m.episodes / m.shards, self.progress.iteration);
-        (0..m.shards).map(move |index| Shard {
+        let shards = self.config.collect.shards_per_iteration;
+        let (episodes, iteration) = (self.config.collect.episodes_per_iteration / shards, self.progress.iteration);
+        (0..shards).map(move |index| Shard {
             kind: ShardKind::Train,
             iteration: Iteration(iteration),
             index,
@@ -355,7 +356,7 @@ impl Trainer {
         episodes: &[EpisodeMetrics],
         evaluation: Option<EvalSummary>,
         timing: Timing,
-        updates: Option<(crate::mappo::UpdateStats, crate::commander::CommanderStats)>,
+        updates: Option<(crate::train::mappo::UpdateStats, crate::train::commander_ppo::CommanderStats)>,
     ) -> Result<(), TrainError> {
         let wall_s = self.progress.wall_s + self.started.elapsed().as_secs_f64();
         let metrics = IterationMetrics::new(

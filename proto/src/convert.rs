@@ -109,9 +109,9 @@ impl From<&Shape> for v1::Shape {
             bodies: shape.bodies as u32,
             landmarks: shape.landmarks as u32,
             dims: shape.dims as u32,
-            targets: shape.targets as u32,
-            heads: shape.heads as u32,
-            extras: shape.extras as u32,
+            goals_per_agent: shape.goals_per_agent as u32,
+            action_components: shape.action_components as u32,
+            agent_state: shape.agent_state as u32,
         }
     }
 }
@@ -125,9 +125,9 @@ impl From<&v1::Shape> for Shape {
             bodies: shape.bodies as usize,
             landmarks: shape.landmarks as usize,
             dims: shape.dims as usize,
-            targets: shape.targets as usize,
-            heads: shape.heads as usize,
-            extras: shape.extras as usize,
+            goals_per_agent: shape.goals_per_agent as usize,
+            action_components: shape.action_components as usize,
+            agent_state: shape.agent_state as usize,
         }
     }
 }
@@ -173,15 +173,15 @@ impl From<&Trajectory> for v1::Trajectory {
             shape: Some(s.into()),
             positions: Some(arrays::from_f32(&state, &trajectory.positions)),
             velocities: Some(arrays::from_f32(&state, &trajectory.velocities)),
-            extras: Some(arrays::from_f32(&[t + 1, b, n, s.extras], &trajectory.extras)),
+            agent_state: Some(arrays::from_f32(&[t + 1, b, n, s.agent_state], &trajectory.agent_state)),
             landmarks: Some(arrays::from_f32(&[b, s.landmarks, s.dims], &trajectory.landmarks)),
-            goals: Some(arrays::from_u32(&[b, n, s.targets], &trajectory.goals)),
-            actions: Some(arrays::from_u8(&[t, b, n, s.heads], &trajectory.actions)),
+            goals: Some(arrays::from_u32(&[b, n, s.goals_per_agent], &trajectory.goals)),
+            actions: Some(arrays::from_u8(&[t, b, n, s.action_components], &trajectory.actions)),
             log_probs: Some(arrays::from_f32(&[t, b, n], &trajectory.log_probs)),
             rewards: Some(arrays::from_f32(&[t, b, n], &trajectory.rewards)),
-            goal_log_probs: Some(arrays::from_f32(&[b, s.targets], &trajectory.goal_log_probs)),
-            costs: Some(arrays::from_f32(&[b, s.targets], &trajectory.costs)),
-            exact_costs: Some(arrays::from_f32(&[b, s.targets], &trajectory.exact_costs)),
+            goal_log_probs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.goal_log_probs)),
+            costs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.costs)),
+            exact_costs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.exact_costs)),
             metrics: trajectory.metrics.iter().map(Into::into).collect(),
         }
     }
@@ -197,15 +197,15 @@ fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, Conve
         shape,
         positions: arrays::to_f32("positions", message.positions, &state)?,
         velocities: arrays::to_f32("velocities", message.velocities, &state)?,
-        extras: arrays::to_f32("extras", message.extras, &[t + 1, b, n, s.extras])?,
+        agent_state: arrays::to_f32("agent_state", message.agent_state, &[t + 1, b, n, s.agent_state])?,
         landmarks: arrays::to_f32("landmarks", message.landmarks, &[b, s.landmarks, s.dims])?,
-        goals: arrays::to_u32("goals", message.goals, &[b, n, s.targets])?,
-        actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.heads])?,
+        goals: arrays::to_u32("goals", message.goals, &[b, n, s.goals_per_agent])?,
+        actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.action_components])?,
         log_probs: arrays::to_f32("log_probs", message.log_probs, &[t, b, n])?,
         rewards: arrays::to_f32("rewards", message.rewards, &[t, b, n])?,
-        goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b, s.targets])?,
-        costs: arrays::to_f32("costs", message.costs, &[b, s.targets])?,
-        exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b, s.targets])?,
+        goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b, s.goals_per_agent])?,
+        costs: arrays::to_f32("costs", message.costs, &[b, s.goals_per_agent])?,
+        exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b, s.goals_per_agent])?,
         metrics: message.metrics.iter().map(Into::into).collect(),
     })
 }
@@ -216,9 +216,9 @@ impl From<&Recording> for v1::Recording {
         Self {
             shape: Some(s.into()),
             positions: Some(arrays::from_f32(&[s.steps + 1, s.bodies, s.dims], &recording.positions)),
-            extras: Some(arrays::from_f32(&[s.steps + 1, s.agents, s.extras], &recording.extras)),
+            agent_state: Some(arrays::from_f32(&[s.steps + 1, s.agents, s.agent_state], &recording.agent_state)),
             landmarks: Some(arrays::from_f32(&[s.landmarks, s.dims], &recording.landmarks)),
-            goals: Some(arrays::from_u32(&[s.agents, s.targets], &recording.goals)),
+            goals: Some(arrays::from_u32(&[s.agents, s.goals_per_agent], &recording.goals)),
         }
     }
 }
@@ -231,9 +231,9 @@ impl TryFrom<v1::Recording> for Recording {
         Ok(Self {
             shape,
             positions: arrays::to_f32("positions", message.positions, &[s.steps + 1, s.bodies, s.dims])?,
-            extras: arrays::to_f32("extras", message.extras, &[s.steps + 1, s.agents, s.extras])?,
+            agent_state: arrays::to_f32("agent_state", message.agent_state, &[s.steps + 1, s.agents, s.agent_state])?,
             landmarks: arrays::to_f32("landmarks", message.landmarks, &[s.landmarks, s.dims])?,
-            goals: arrays::to_u32("goals", message.goals, &[s.agents, s.targets])?,
+            goals: arrays::to_u32("goals", message.goals, &[s.agents, s.goals_per_agent])?,
         })
     }
 }

@@ -11,7 +11,7 @@ use magex::local::LocalCollector;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
-use magex_learner::collector::RunEvent;
+use magex_learner::run_events::RunEvent;
 use magex_learner::trainer::{Outcome, Trainer};
 use std::path::Path;
 use std::sync::Arc;
@@ -24,7 +24,8 @@ pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
         "[run]\nseed = 5\nmax_steps = {}\ntarget_success = 2.0\neval_every = 2\neval_episodes = 6\nfinal_episodes = 6\n\
          checkpoint_every = 2\n[task]\nname = 'simple-spread'\nagents = {agents}\nhorizon = 20\nspawn = 'uniform'\n\
          [executor]\nkind = '{kind}'\nhidden = 32\nneighbours = 3\n\
-         [mappo]\nepisodes = 8\nshards = 4\nepochs = 2\nminibatch = 200\nchunk = 5\n",
+         [collect]\nepisodes_per_iteration = 8\nshards_per_iteration = 4\n\
+         [mappo]\nepochs = 2\nminibatch_size = 200\nchunk_length = 5\n",
         iterations * 8 * 20
     );
     RunConfig::from_toml(&text).unwrap_or_else(|e| panic!("the test's configuration: {e}"))
@@ -34,7 +35,7 @@ pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
 pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
     let mut config = small(kind, agents, iterations);
     config.task = TaskConfig { horizon: config.task.horizon, ..TaskConfig::of(name, agents, Spawn::Uniform) };
-    config.commander.random_share = 0.5;
+    config.commander.random_assignment_fraction = 0.5;
     config.resolved().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
 }
 

@@ -257,7 +257,7 @@ fn the_cluster_trains_scales_and_survives_and_learns_the_same_bits() {
 
 /// A run of seconds.
 const SHORT: &str = "[run]\nmax_steps = 1600\neval_episodes = 4\nfinal_episodes = 6\n[task]\nname = 'simple-spread'\nagents = 5\n\
-    spawn = 'uniform'\n[executor]\nkind = 'local'\n[mappo]\nepisodes = 4\nepochs = 2\n";
+    spawn = 'uniform'\n[executor]\nkind = 'local'\n[collect]\nepisodes_per_iteration = 4\n[mappo]\nepochs = 2\n";
 
 #[test]
 #[ignore = "needs a Docker engine; .ci/run runs it where there is one"]

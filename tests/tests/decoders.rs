@@ -139,7 +139,7 @@ fn trajectory(run: &Run) -> ShardResult {
         shape,
         positions: vec![0.5; (t + 1) * b * n * 2],
         velocities: vec![0.25; (t + 1) * b * n * 2],
-        extras: vec![],
+        agent_state: vec![],
         landmarks: vec![0.1; b * n * 2],
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],

@@ -8,8 +8,9 @@ use magex_core::ids::{RunId, Shard};
 use magex_core::task::TaskName;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint;
-use magex_learner::collector::{CollectError, Collector, RunEvent, StopReason};
-use magex_learner::metrics::Summary;
+use magex_learner::collector::Collector;
+use magex_learner::report::metrics_file::Summary;
+use magex_learner::run_events::{CollectError, RunEvent, StopReason};
 use magex_learner::trainer::{EVAL_SET_TRAINING, Outcome, Trainer};
 use magex_proto::weights::Weights;
 use magex_tests::{drive, small, small_task, train, updates};
@@ -55,7 +56,7 @@ fn every_task_gives_the_same_bits_and_ratios_of_one() {
 fn random_goals_reach_the_share_of_the_training_episodes_and_no_evaluation() {
     let config = small_task(TaskName::Drones, ExecutorKind::Local, 4, 2);
     let mut assigned = config.clone();
-    assigned.commander.random_share = 0.0;
+    assigned.commander.random_assignment_fraction = 0.0;
     assert_ne!(hash(&config, 1, 1), hash(&assigned, 1, 1));
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
     let Outcome::Finished(summary) = &ran.outcome else { panic!("not finished") };

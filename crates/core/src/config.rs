@@ -34,6 +34,9 @@ pub struct RunConfig {
     /// The goal commander.
     #[serde(default)]
     pub commander: CommanderConfig,
+    /// What an iteration collects.
+    #[serde(default)]
+    pub collect: CollectConfig,
     /// The learner's algorithm.
     #[serde(default)]
     pub mappo: MappoConfig,
@@ -213,7 +216,7 @@ pub struct CommanderConfig {
     /// Canonical order of the `ranking` scheduler.
     pub order: CanonicalOrder,
     /// Share of the training episodes whose goals are a random matching, whatever the scheduler: agents meet more often.
-    pub random_share: f32,
+    pub random_assignment_fraction: f32,
     /// Adam's step size.
     pub learning_rate: f64,
     /// PPO epochs over the iteration's episodes.
@@ -234,7 +237,7 @@ impl Default for CommanderConfig {
             kind: CommanderKind::Pairwise,
             hidden: 32,
             order: CanonicalOrder::Angle,
-            random_share: 0.0,
+            random_assignment_fraction: 0.0,
             learning_rate: 1e-3,
             epochs: 3,
             minibatch: 64,
@@ -245,14 +248,26 @@ impl Default for CommanderConfig {
     }
 }
 
+/// `[collect]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CollectConfig {
+    /// Episodes per iteration; 0 means about 200 agents' worth: 40 for N = 5, 12 for N = 20, 4 from N = 50 on.
+    pub episodes_per_iteration: u32,
+    /// S: shards that an iteration's episodes are cut into; must divide `episodes_per_iteration`.
+    pub shards_per_iteration: u32,
+}
+
+impl Default for CollectConfig {
+    fn default() -> Self {
+        Self { episodes_per_iteration: 0, shards_per_iteration: 4 }
+    }
+}
+
 /// `[mappo]`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MappoConfig {
-    /// Episodes per iteration; 0 means about 200 agents' worth: 40 for N = 5, 12 for N = 20, 4 from N = 50 on.
-    pub episodes: u32,
-    /// S: shards that an iteration's episodes are cut into; must divide `episodes`.
-    pub shards: u32,
     /// γ.
     pub gamma: f32,
     /// λ of generalised advantage estimation.
@@ -260,21 +275,21 @@ pub struct MappoConfig {
     /// Passes over an iteration's data.
     pub epochs: u32,
     /// Agent samples per minibatch (rounded to whole joint states or chunks).
-    pub minibatch: usize,
+    pub minibatch_size: usize,
     /// L: steps of a chunk through which the memory is differentiated; must divide the horizon.
-    pub chunk: usize,
+    pub chunk_length: usize,
     /// Parts of a minibatch whose gradients are summed in a fixed order; computed by as many threads as there are.
-    pub grad_shards: usize,
+    pub gradient_slices: usize,
     /// ε of the clipped surrogate and of the clipped value.
-    pub clip: f32,
+    pub clip_epsilon: f32,
     /// Weight of the entropy.
-    pub entropy: f32,
+    pub entropy_coef: f32,
     /// δ of the Huber value loss, in normalised units.
     pub huber_delta: f32,
     /// Normalise value targets by running statistics (ValueNorm).
     pub value_norm: bool,
     /// Bootstrap the value of the true last state: the horizon is a time limit, not an end.
-    pub bootstrap: bool,
+    pub bootstrap_at_horizon: bool,
     /// Adam's step size of the actor.
     pub actor_learning_rate: f64,
     /// Adam's step size of the critic.
@@ -290,19 +305,17 @@ pub struct MappoConfig {
 impl Default for MappoConfig {
     fn default() -> Self {
         Self {
-            episodes: 0,
-            shards: 4,
             gamma: 0.99,
             gae_lambda: 0.95,
             epochs: 5,
-            minibatch: 2048,
-            chunk: 10,
-            grad_shards: 4,
-            clip: 0.2,
-            entropy: 0.01,
+            minibatch_size: 2048,
+            chunk_length: 10,
+            gradient_slices: 4,
+            clip_epsilon: 0.2,
+            entropy_coef: 0.01,
             huber_delta: 10.0,
             value_norm: true,
-            bootstrap: true,
+            bootstrap_at_horizon: true,
             actor_learning_rate: 7e-4,
             critic_learning_rate: 7e-4,
             linear_decay: false,
@@ -320,7 +333,8 @@ impl Default for RunConfig {
             task: default_task(),
             executor: ExecutorConfig::default(),
             commander: CommanderConfig::default(),
-            mappo: MappoConfig { episodes: 4, ..MappoConfig::default() },
+            collect: CollectConfig { episodes_per_iteration: 4, ..CollectConfig::default() },
+            mappo: MappoConfig::default(),
         }
     }
 }
@@ -335,8 +349,8 @@ impl RunConfig {
     /// Fills in what "0 means default" stands for, and checks every range.
     pub fn resolved(mut self) -> Result<Self, ConfigError> {
         self.task = self.task.resolved();
-        if self.mappo.episodes == 0 {
-            self.mappo.episodes = self.derived_episodes();
+        if self.collect.episodes_per_iteration == 0 {
+            self.collect.episodes_per_iteration = self.derived_episodes();
         }
         self.validate()?;
         Ok(self)
@@ -347,15 +361,15 @@ impl RunConfig {
         toml::to_string(self).map_err(|e| ConfigError::Syntax(e.to_string()))
     }
 
-    /// What `mappo.episodes = 0` stands for: about 200 agents' worth, a multiple of the shards.
+    /// What `collect.episodes_per_iteration = 0` stands for: about 200 agents' worth, a multiple of the shards.
     pub fn derived_episodes(&self) -> u32 {
         let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
-        wanted.next_multiple_of(self.mappo.shards.max(1))
+        wanted.next_multiple_of(self.collect.shards_per_iteration.max(1))
     }
 
     /// Joint environment steps of one iteration.
     pub fn steps_per_iteration(&self) -> u64 {
-        u64::from(self.mappo.episodes) * u64::from(self.task.horizon)
+        u64::from(self.collect.episodes_per_iteration) * u64::from(self.task.horizon)
     }
 
     /// Whole iterations that the budget pays for (at least one).
@@ -366,7 +380,7 @@ impl RunConfig {
     fn validate(&self) -> Result<(), ConfigError> {
         let range = ConfigError::Range;
         self.task.validate().map_err(range)?;
-        let (r, e, c, m) = (&self.run, &self.executor, &self.commander, &self.mappo);
+        let (r, e, c, k, m) = (&self.run, &self.executor, &self.commander, &self.collect, &self.mappo);
         within("run.seed", r.seed as f64, 0.0, i64::MAX as f64)?;
         within("run.max_steps", r.max_steps as f64, 1.0, 1e12)?;
         within("run.target_success", r.target_success.into(), 0.0, 2.0)?;
@@ -385,32 +399,35 @@ impl RunConfig {
         within("executor.hidden", e.hidden as f64, 8.0, 1024.0)?;
         within("executor.neighbours", e.neighbours as f64, 1.0, 64.0)?;
         within("commander.hidden", c.hidden as f64, 4.0, 1024.0)?;
-        within("commander.random_share", c.random_share.into(), 0.0, 1.0)?;
+        within("commander.random_assignment_fraction", c.random_assignment_fraction.into(), 0.0, 1.0)?;
         within("commander.learning_rate", c.learning_rate, 0.0, 1.0)?;
         within("commander.epochs", c.epochs as f64, 1.0, 100.0)?;
         within("commander.minibatch", c.minibatch as f64, 1.0, 1e6)?;
         within("commander.clip", c.clip.into(), 0.001, 10.0)?;
         within("commander.entropy", c.entropy.into(), 0.0, 10.0)?;
         within("commander.max_grad_norm", c.max_grad_norm.into(), 1e-6, 1e9)?;
-        within("mappo.episodes", m.episodes.into(), 1.0, 1e5)?;
-        within("mappo.shards", m.shards.into(), 1.0, m.episodes.into())?;
-        if m.episodes % m.shards != 0 {
-            return Err(range(format!("mappo.shards: {} must divide mappo.episodes = {}", m.shards, m.episodes)));
+        within("collect.episodes_per_iteration", k.episodes_per_iteration.into(), 1.0, 1e5)?;
+        within("collect.shards_per_iteration", k.shards_per_iteration.into(), 1.0, k.episodes_per_iteration.into())?;
+        if k.episodes_per_iteration % k.shards_per_iteration != 0 {
+            return Err(range(format!(
+                "collect.shards_per_iteration: {} must divide collect.episodes_per_iteration = {}",
+                k.shards_per_iteration, k.episodes_per_iteration
+            )));
         }
         within("mappo.gamma", m.gamma.into(), 0.0, 1.0)?;
         within("mappo.gae_lambda", m.gae_lambda.into(), 0.0, 1.0)?;
         within("mappo.epochs", m.epochs.into(), 1.0, 1000.0)?;
-        within("mappo.minibatch", m.minibatch as f64, 1.0, 1e8)?;
-        within("mappo.chunk", m.chunk as f64, 1.0, self.task.horizon.into())?;
-        if e.kind != ExecutorKind::Local && !(self.task.horizon as usize).is_multiple_of(m.chunk) {
+        within("mappo.minibatch_size", m.minibatch_size as f64, 1.0, 1e8)?;
+        within("mappo.chunk_length", m.chunk_length as f64, 1.0, self.task.horizon.into())?;
+        if e.kind != ExecutorKind::Local && !(self.task.horizon as usize).is_multiple_of(m.chunk_length) {
             return Err(range(format!(
-                "mappo.chunk: {} must divide task.horizon = {}, or chunks would cross episodes",
-                m.chunk, self.task.horizon
+                "mappo.chunk_length: {} must divide task.horizon = {}, or chunks would cross episodes",
+                m.chunk_length, self.task.horizon
             )));
         }
-        within("mappo.grad_shards", m.grad_shards as f64, 1.0, 64.0)?;
-        within("mappo.clip", m.clip.into(), 0.001, 10.0)?;
-        within("mappo.entropy", m.entropy.into(), 0.0, 10.0)?;
+        within("mappo.gradient_slices", m.gradient_slices as f64, 1.0, 64.0)?;
+        within("mappo.clip_epsilon", m.clip_epsilon.into(), 0.001, 10.0)?;
+        within("mappo.entropy_coef", m.entropy_coef.into(), 0.0, 10.0)?;
         within("mappo.huber_delta", m.huber_delta.into(), 1e-3, 1e6)?;
         within("mappo.actor_learning_rate", m.actor_learning_rate, 0.0, 1.0)?;
         within("mappo.critic_learning_rate", m.critic_learning_rate, 0.0, 1.0)?;
@@ -444,8 +461,8 @@ mod tests {
             ("[mappo]\ngama = 0.9", "gama"),
             ("[executer]\nkind = 'local'", "executer"),
             ("[mappo]\ngamma = 1.5", "mappo.gamma"),
-            ("[mappo]\nepisodes = 9\nshards = 4", "mappo.shards"),
-            ("[mappo]\nchunk = 7", "mappo.chunk"),
+            ("[collect]\nepisodes_per_iteration = 9\nshards_per_iteration = 4", "collect.shards_per_iteration"),
+            ("[mappo]\nchunk_length = 7", "mappo.chunk_length"),
             ("[executor]\nfeature_size = 20", "executor.feature_size"),
             ("[run]\nmax_steps = 0", "run.max_steps"),
             ("[task]\nname = 'simple-spread'\nagents = 0\nspawn = 'lines'", "task.agents"),

@@ -232,8 +232,8 @@ impl TaskConfig {
     }
 
     /// X: further numbers of an agent's state that an agent sees and the wire carries.
-    pub fn extras(&self) -> usize {
-        if self.name == TaskName::Drones { DroneConfig::EXTRAS } else { 0 }
+    pub fn agent_state(&self) -> usize {
+        if self.name == TaskName::Drones { DroneConfig::AGENT_STATE } else { 0 }
     }
 
     /// Choices of each action component.
@@ -281,9 +281,9 @@ impl TaskConfig {
             bodies: self.agents + self.balls(),
             landmarks: self.agents,
             dims: self.dims(),
-            extras: self.extras(),
-            targets: self.stages().len(),
-            heads: self.action_heads().len(),
+            agent_state: self.agent_state(),
+            goals_per_agent: self.stages().len(),
+            action_components: self.action_heads().len(),
         }
     }
 
@@ -393,9 +393,9 @@ mod tests {
             let task = TaskConfig::of(name, 4, Spawn::Uniform);
             let back: TaskConfig = serde_json::from_str(&serde_json::to_string(&task).unwrap()).unwrap();
             assert_eq!(back.resolved(), task);
-            assert_eq!(task.shape(3).targets, task.stages().len());
+            assert_eq!(task.shape(3).goals_per_agent, task.stages().len());
             let mut other = task.clone();
-            (other.reward.bonus, other.push_ball.arc, other.drones.bonus) = (0.5, 0.5, 0.5);
+            (other.reward.bonus, other.push_ball.turn_length, other.drones.bonus) = (0.5, 0.5, 0.5);
             let error = other.validate().unwrap_err();
             assert!(error.contains("belongs to") && error.contains(&name.to_string()), "{error}");
         }

@@ -19,11 +19,11 @@ pub struct Shape {
     /// D: space dimensions.
     pub dims: usize,
     /// X: further numbers of an agent's state (drones: 6).
-    pub extras: usize,
+    pub agent_state: usize,
     /// K: targets per agent (Simple Spread: 1, its landmark; Push Ball: 2, its ball and the ball's landmark).
-    pub targets: usize,
+    pub goals_per_agent: usize,
     /// H: components of an action.
-    pub heads: usize,
+    pub action_components: usize,
 }
 
 /// B whole episodes of T joint steps as the actor saw them: states, not observations. All arrays are row-major.
@@ -39,7 +39,7 @@ pub struct Trajectory {
     /// [T+1, B, E, D] world units per second.
     pub velocities: Vec<f32>,
     /// [T+1, B, N, X] further state of the agents, by task.
-    pub extras: Vec<f32>,
+    pub agent_state: Vec<f32>,
     /// [B, G, D] world units.
     pub landmarks: Vec<f32>,
     /// [B, N, K] what each agent was assigned: the k-th is an index into the group that the task's k-th stage leads to.
@@ -92,7 +92,7 @@ pub struct Recording {
     /// [T+1, E, D]
     pub positions: Vec<f32>,
     /// [T+1, N, X]
-    pub extras: Vec<f32>,
+    pub agent_state: Vec<f32>,
     /// [G, D]
     pub landmarks: Vec<f32>,
     /// [N, K]
@@ -139,13 +139,13 @@ impl Trajectory {
         let floats: [(&str, &[f32], usize); 9] = [
             ("positions", &self.positions, state),
             ("velocities", &self.velocities, state),
-            ("extras", &self.extras, (t + 1) * b * n * s.extras),
+            ("agent_state", &self.agent_state, (t + 1) * b * n * s.agent_state),
             ("landmarks", &self.landmarks, b * s.landmarks * s.dims),
             ("log_probs", &self.log_probs, t * b * n),
             ("rewards", &self.rewards, t * b * n),
-            ("goal_log_probs", &self.goal_log_probs, b * s.targets),
-            ("costs", &self.costs, b * s.targets),
-            ("exact_costs", &self.exact_costs, b * s.targets),
+            ("goal_log_probs", &self.goal_log_probs, b * s.goals_per_agent),
+            ("costs", &self.costs, b * s.goals_per_agent),
+            ("exact_costs", &self.exact_costs, b * s.goals_per_agent),
         ];
         for (name, data, expected) in floats {
             if data.len() != expected {
@@ -158,22 +158,22 @@ impl Trajectory {
         if let Some(place) = self.log_probs.iter().position(|&x| x > 1e-4) {
             return Err(format!("trajectory.log_probs[{place}]: {} is above 0", self.log_probs[place]));
         }
-        if self.goals.len() != b * n * s.targets {
+        if self.goals.len() != b * n * s.goals_per_agent {
             return Err(format!(
                 "trajectory.goals: {} entries, the shape asks for {}",
                 self.goals.len(),
-                b * n * s.targets
+                b * n * s.goals_per_agent
             ));
         }
         let bound = s.landmarks.max(s.bodies) as u32;
         if let Some(place) = self.goals.iter().position(|&g| g >= bound) {
             return Err(format!("trajectory.goals[{place}]: {} is not below {bound}", self.goals[place]));
         }
-        if self.actions.len() != t * b * n * s.heads {
+        if self.actions.len() != t * b * n * s.action_components {
             return Err(format!(
                 "trajectory.actions: {} entries, the shape asks for {}",
                 self.actions.len(),
-                t * b * n * s.heads
+                t * b * n * s.action_components
             ));
         }
         if self.metrics.len() != b {

@@ -22,11 +22,11 @@ pub fn throughput(agents: usize, worlds: usize, seconds: f64) -> Result<f64, Env
 /// scored at every horizon; contacts, collisions, rewards and arrival included. Runs for about `seconds`.
 pub fn throughput_of(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f64, EnvError> {
     let shape = task.shape(worlds);
-    let table = random_actions(worlds * shape.agents * shape.heads, task.action_heads()[0] as u32);
+    let table = random_actions(worlds * shape.agents * shape.action_components, task.action_heads()[0] as u32);
     let mut rewards = vec![0.0; worlds * shape.agents];
     // Every agent goes for what has its own number.
     let goals: Vec<u32> = (0..worlds)
-        .flat_map(|_| (0..shape.agents as u32).flat_map(|agent| std::iter::repeat_n(agent, shape.targets)))
+        .flat_map(|_| (0..shape.agents as u32).flat_map(|agent| std::iter::repeat_n(agent, shape.goals_per_agent)))
         .collect();
     let (start, mut joint_steps, mut round) = (Instant::now(), 0u64, 0);
     loop {
@@ -54,7 +54,7 @@ pub fn drone_throughput(agents: usize, episodes: usize, piloted: bool, seconds: 
     let mut stream = Key::new(1, Purpose::Bench, &[4]).stream();
     let table: Vec<Vec<u8>> = (0..TABLE).map(|_| (0..3 * numbers).map(|_| stream.below(3) as u8).collect()).collect();
     let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..agents as u32).collect();
-    let (mut positions, mut extras) = (vec![0.0; 3 * numbers], vec![0.0; DroneConfig::EXTRAS * numbers]);
+    let (mut positions, mut agent_state) = (vec![0.0; 3 * numbers], vec![0.0; DroneConfig::AGENT_STATE * numbers]);
     let (mut actions, mut rewards) = (vec![1; 3 * numbers], vec![0.0; numbers]);
     let (start, mut commands, mut round) = (Instant::now(), 0u64, 0);
     loop {
@@ -65,11 +65,11 @@ pub fn drone_throughput(agents: usize, episodes: usize, piloted: bool, seconds: 
         for step in 0..task.horizon as usize {
             if piloted {
                 drones.write_positions(&mut positions)?;
-                drones.write_extras(&mut extras)?;
+                drones.write_agent_state(&mut agent_state)?;
                 let view = View {
                     positions: &positions,
                     velocities: &positions,
-                    extras: &extras,
+                    agent_state: &agent_state,
                     landmarks: &landmarks,
                     goals: &goals,
                 };

@@ -40,7 +40,7 @@ pub const MOST_SPEED: f64 = 2.0;
 /// B episodes of N drones and N landmarks, stepped together.
 ///
 /// Positions, velocities and landmarks are `[B, N, 3]` in m and m/s, goals `[B, N]`, actions `[B, N, 3]`, rewards
-/// `[B, N]`; extras `[B, N, 6]` are the target velocity, x and y of the body's up axis, and 1 for a drone that is out.
+/// `[B, N]`; agent_state `[B, N, 6]` are the target velocity, x and y of the body's up axis, and 1 for a drone that is out.
 ///
 /// * **Command.** 30 per second. Each axis of the target velocity v\* changes by (+1, 0, −1) · 5 m/s² / 30 for the
 ///   actions (0 forward, 1 stop, 2 backward); then v\* is scaled to at most 2 m/s. A command is held for
@@ -188,11 +188,11 @@ impl Env for Drones {
         Ok(())
     }
 
-    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("extras", out.len(), DroneConfig::EXTRAS * self.numbers())?;
-        let rows = out.chunks_exact_mut(DroneConfig::EXTRAS);
-        for (out, extras) in rows.zip(self.episodes.iter().flat_map(Episode::extras)) {
-            out.copy_from_slice(&extras);
+    fn write_agent_state(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("agent_state", out.len(), DroneConfig::AGENT_STATE * self.numbers())?;
+        let rows = out.chunks_exact_mut(DroneConfig::AGENT_STATE);
+        for (out, agent_state) in rows.zip(self.episodes.iter().flat_map(Episode::agent_state)) {
+            out.copy_from_slice(&agent_state);
         }
         Ok(())
     }

@@ -28,7 +28,7 @@ pub trait Env: Send {
     fn write_velocities(&self, out: &mut [f32]) -> Result<(), EnvError>;
 
     /// Writes the further state of the agents [B, N, X].
-    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError>;
+    fn write_agent_state(&self, out: &mut [f32]) -> Result<(), EnvError>;
 
     /// Assigns goals [B, N, K]; see [`TaskConfig::stages`].
     fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError>;
@@ -82,7 +82,7 @@ pub struct View<'a> {
     /// [S, E, D]
     pub velocities: &'a [f32],
     /// [S, N, X]
-    pub extras: &'a [f32],
+    pub agent_state: &'a [f32],
     /// [Q, G, D]
     pub landmarks: &'a [f32],
     /// [Q, N, K]

@@ -64,7 +64,7 @@ macro_rules! either {
 
 impl PushBall {
     /// One episode per stream, spawned as the task says; `training` mixes in starts in line with balls
-    /// (`task.push_ball.aligned`). Errors if the task does not validate.
+    /// (`task.push_ball.start_in_line_fraction`). Errors if the task does not validate.
     pub fn new(task: &TaskConfig, streams: impl Iterator<Item = Stream>, training: bool) -> Result<Self, EnvError> {
         task.validate().map_err(EnvError::Task)?;
         let (mut positions, mut landmarks) = (Vec::new(), Vec::new());
@@ -190,8 +190,8 @@ impl Env for PushBall {
         Ok(())
     }
 
-    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("extras", out.len(), 0)
+    fn write_agent_state(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("agent_state", out.len(), 0)
     }
 
     fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError> {

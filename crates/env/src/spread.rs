@@ -185,8 +185,8 @@ impl Env for Spread {
         Ok(())
     }
 
-    fn write_extras(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("extras", out.len(), 0)
+    fn write_agent_state(&self, out: &mut [f32]) -> Result<(), EnvError> {
+        check_len("agent_state", out.len(), 0)
     }
 
     fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError> {

@@ -32,8 +32,13 @@ fn play(task: &TaskConfig, episodes: u32) -> (Vec<Score>, Option<u32>) {
     for step in 1..=task.horizon {
         env.write_positions(&mut positions).unwrap();
         env.write_velocities(&mut velocities).unwrap();
-        let view =
-            View { positions: &positions, velocities: &velocities, extras: &[], landmarks: &landmarks, goals: &goals };
+        let view = View {
+            positions: &positions,
+            velocities: &velocities,
+            agent_state: &[],
+            landmarks: &landmarks,
+            goals: &goals,
+        };
         scripted_push_ball(&view, n, &mut actions).unwrap();
         env.step(&actions, &mut rewards).unwrap();
         if solved.is_none() && mean(&env.scores(), |score| score.success) >= 0.97 {
@@ -113,7 +118,7 @@ fn the_choice_depends_on_the_state_alone() {
             let view = View {
                 positions: &p[20 * b..20 * b + 20],
                 velocities: &v[20 * b..20 * b + 20],
-                extras: &[],
+                agent_state: &[],
                 landmarks: &landmarks[10 * b..10 * b + 10],
                 goals: &goals[10 * b..10 * b + 10],
             };
@@ -126,7 +131,7 @@ fn the_choice_depends_on_the_state_alone() {
     }
     let mut together = vec![9; 30];
     let view =
-        View { positions: &positions, velocities: &velocities, extras: &[], landmarks: &landmarks, goals: &goals };
+        View { positions: &positions, velocities: &velocities, agent_state: &[], landmarks: &landmarks, goals: &goals };
     scripted_push_ball(&view, 5, &mut together).unwrap();
     assert_eq!(together, one_by_one);
 
@@ -139,7 +144,7 @@ fn the_choice_depends_on_the_state_alone() {
         (View { velocities: &velocities[1..], ..view }, "velocities"),
         (View { landmarks: &landmarks[1..], ..view }, "landmarks"),
         (View { goals: &goals[1..], ..view }, "goals"),
-        (View { extras: &[0.0], ..view }, "extras"),
+        (View { agent_state: &[0.0], ..view }, "agent_state"),
     ] {
         let error = scripted_push_ball(&view, 5, &mut together).unwrap_err().to_string();
         assert!(error.starts_with(field), "{error}");

@@ -104,7 +104,7 @@ impl Variation {
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
         // Nothing is learned here; the chunk need not fit the horizon.
-        config.mappo.chunk = 1;
+        config.mappo.chunk_length = 1;
         Ok(config.resolved()?)
     }
 
@@ -114,7 +114,7 @@ impl Variation {
             Controller::Learned => Roller::new(config, weights)?,
             Controller::Scripted => Roller::scripted(config)?,
         };
-        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)?, random_share: 0.0 })
+        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)?, random_assignment_fraction: 0.0 })
     }
 
     /// The scheduler that hands out goals.

@@ -13,8 +13,8 @@ use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_learner::checkpoint::{self, CheckpointError, Learned, sha256_hex};
-use magex_learner::commander::CommanderPpo;
-use magex_learner::mappo::Mappo;
+use magex_learner::train::commander_ppo::CommanderPpo;
+use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
 /// The effective configuration.

@@ -5,7 +5,8 @@ use magex_commander::learned::answer;
 use magex_core::config::{CommanderKind, RunConfig};
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
-use magex_learner::collector::{CollectError, Collector, RunEvent, StopReason};
+use magex_learner::collector::Collector;
+use magex_learner::run_events::{CollectError, RunEvent, StopReason};
 use magex_nets::commander::Commander;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
@@ -21,7 +22,7 @@ pub struct Crew {
     /// Hands out the goals.
     pub commander: Commander,
     /// Share of the training episodes with random goals.
-    pub random_share: f32,
+    pub random_assignment_fraction: f32,
 }
 
 impl Crew {
@@ -30,14 +31,14 @@ impl Crew {
         Ok(Self {
             roller: Roller::new(config, weights)?,
             commander: commander(config, weights, scheduler)?,
-            random_share: config.commander.random_share,
+            random_assignment_fraction: config.commander.random_assignment_fraction,
         })
     }
 
     /// Rolls out one shard.
     pub fn work(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
         self.roller
-            .rollout(shard, |request| answer(&self.commander, self.random_share, request, &|| true))
+            .rollout(shard, |request| answer(&self.commander, self.random_assignment_fraction, request, &|| true))
             .map_err(|e| CollectError::Shard { shard: *shard, reason: e.to_string() })
     }
 

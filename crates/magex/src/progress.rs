@@ -5,7 +5,7 @@ use crate::output::{colours, note, share, thousands};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
 use magex_core::task::TaskName;
-use magex_learner::collector::RunEvent;
+use magex_learner::run_events::RunEvent;
 use serde::Deserialize;
 use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};

@@ -107,12 +107,12 @@ mod tests {
                 bodies: 2,
                 landmarks: 2,
                 dims: 2,
-                extras: 0,
-                targets: 1,
-                heads: 1,
+                agent_state: 0,
+                goals_per_agent: 1,
+                action_components: 1,
             },
             positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
-            extras: vec![],
+            agent_state: vec![],
             landmarks: vec![0.5, 0.0, 1.0, 0.0],
             goals: vec![0, 1],
         }
@@ -121,7 +121,7 @@ mod tests {
     /// Two agents, each with a ball of its own.
     fn with_balls() -> Recording {
         let mut recording = recording();
-        (recording.shape.bodies, recording.shape.targets) = (4, 2);
+        (recording.shape.bodies, recording.shape.goals_per_agent) = (4, 2);
         recording.positions = (0..16).map(|k| 0.1 * k as f32).collect();
         recording.goals = vec![1, 0, 0, 1];
         recording
@@ -130,12 +130,12 @@ mod tests {
     /// Two drones, of which the second is out at the end.
     fn in_space() -> Recording {
         let mut recording = recording();
-        (recording.shape.dims, recording.shape.extras, recording.shape.heads) = (3, 6, 3);
+        (recording.shape.dims, recording.shape.agent_state, recording.shape.action_components) = (3, 6, 3);
         recording.positions = (0..12).map(|k| 0.1 * k as f32).collect();
         recording.landmarks = vec![0.5, 0.0, 1.5, 1.0, 0.0, 1.5];
-        recording.extras = vec![0.0; 24];
-        recording.extras[0] = -1.5;
-        recording.extras[23] = 1.0;
+        recording.agent_state = vec![0.0; 24];
+        recording.agent_state[0] = -1.5;
+        recording.agent_state[23] = 1.0;
         recording
     }
 
@@ -187,16 +187,18 @@ mod tests {
         assert!(refuse(|r| r.goals.push(0)).starts_with("episodes[0].goals: 3 entries"));
         assert!(refuse(|r| r.shape.bodies = 1).starts_with("episodes[0].shape"));
         assert!(refuse(|r| r.goals[1] = 2).ends_with("goals: entry 1 is 2, there are 2 landmarks"));
-        assert!(refuse(|r| r.extras.push(0.0)).starts_with("episodes[0].extras: 1 numbers, the shape asks for 0"));
+        assert!(
+            refuse(|r| r.agent_state.push(0.0)).starts_with("episodes[0].agent_state: 1 numbers, the shape asks for 0")
+        );
         assert_eq!(replay_html(&info(TaskName::SimpleSpread, "none"), &[]), Err(ReplayError::Empty));
     }
 
     #[test]
-    fn extras_are_packed_and_checked_like_positions() {
+    fn agent_state_are_packed_and_checked_like_positions() {
         let recording = in_space();
         let data = data(&page_of(TaskName::Drones, "drones", &recording).unwrap());
         let episode = &data["episodes"][0];
-        assert_eq!(episode["extras"], 6);
+        assert_eq!(episode["agent_state"], 6);
         // Two bytes a number, three bytes in four digits: -1500 and 0 first, 0 and 1000 last.
         let text = episode["extra_values"].as_str().unwrap();
         assert_eq!(text.len(), 24 * 2 / 3 * 4);
@@ -207,10 +209,13 @@ mod tests {
             change(&mut bad);
             page_of(TaskName::Drones, "bad", &bad).unwrap_err().to_string()
         };
-        assert!(refuse(|r| r.extras.truncate(23)).starts_with("episodes[0].extras: 23 numbers, the shape asks for 24"));
-        assert!(refuse(|r| r.extras[7] = f32::NAN).starts_with("episodes[0].extras: entry 7 is NaN"));
-        assert!(refuse(|r| r.extras[8] = f32::INFINITY).starts_with("episodes[0].extras: entry 8 is inf"));
-        assert!(refuse(|r| r.shape.extras = 5).starts_with("episodes[0].shape: extras is 5"));
+        assert!(
+            refuse(|r| r.agent_state.truncate(23))
+                .starts_with("episodes[0].agent_state: 23 numbers, the shape asks for 24")
+        );
+        assert!(refuse(|r| r.agent_state[7] = f32::NAN).starts_with("episodes[0].agent_state: entry 7 is NaN"));
+        assert!(refuse(|r| r.agent_state[8] = f32::INFINITY).starts_with("episodes[0].agent_state: entry 8 is inf"));
+        assert!(refuse(|r| r.shape.agent_state = 5).starts_with("episodes[0].shape: agent_state is 5"));
     }
 
     #[test]
@@ -226,6 +231,6 @@ mod tests {
         assert!(refuse(|r| r.goals[2] = 3).ends_with("goals: entry 2 is 3, there are 2 balls"));
         assert!(refuse(|r| r.goals[3] = 2).ends_with("goals: entry 3 is 2, there are 2 landmarks"));
         let spread = page("bad", &with_balls()).unwrap_err().to_string();
-        assert!(spread.starts_with("episodes[0].shape: targets is 2, the task assigns 1"), "{spread}");
+        assert!(spread.starts_with("episodes[0].shape: goals_per_agent is 2, the task assigns 1"), "{spread}");
     }
 }

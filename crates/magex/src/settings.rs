@@ -41,10 +41,10 @@ impl Overrides {
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
             // What was derived from the team size is derived anew; what was chosen stays.
-            let derived = config.mappo.episodes == config.derived_episodes();
+            let derived = config.collect.episodes_per_iteration == config.derived_episodes();
             resize(&mut config.task, agents);
             if derived {
-                config.mappo.episodes = 0;
+                config.collect.episodes_per_iteration = 0;
             }
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);

@@ -11,7 +11,7 @@ use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
 use magex_core::ids::Iteration;
-use magex_learner::collector::{IterationReport, RunEvent};
+use magex_learner::run_events::{IterationReport, RunEvent};
 use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::watch_run_response::Event;

@@ -19,8 +19,9 @@ agents = 5
 spawn = 'uniform'
 [executor]
 kind = 'local'
+[collect]
+episodes_per_iteration = 4
 [mappo]
-episodes = 4
 epochs = 2
 ";
 

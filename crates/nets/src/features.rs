@@ -22,7 +22,7 @@ pub struct JointStates<'a> {
     /// [S, E, D] world units per second.
     pub velocities: &'a [f32],
     /// [S, N, X]
-    pub extras: &'a [f32],
+    pub agent_state: &'a [f32],
     /// [Q, G, D] world units.
     pub landmarks: &'a [f32],
     /// [Q, N, K]; see [`TaskConfig::stages`].
@@ -41,9 +41,9 @@ pub struct FeatureSpec {
     /// D: 2 or 3.
     pub dims: usize,
     /// X: further numbers of an agent's state.
-    pub extras: usize,
+    pub agent_state: usize,
     /// K: targets per agent.
-    pub targets: usize,
+    pub goals_per_agent: usize,
     /// Half side of the map: the unit of absolute positions.
     pub half_side: f32,
     /// Goal positions relative to the agent (ours), or absolute (literal reading of the paper).
@@ -82,8 +82,8 @@ impl FeatureSpec {
             balls: task.balls(),
             landmarks: task.agents,
             dims: task.dims(),
-            extras: task.extras(),
-            targets: task.stages().len(),
+            agent_state: task.agent_state(),
+            goals_per_agent: task.stages().len(),
             half_side: task.side / 2.0,
             relative_goal,
             neighbours,
@@ -95,15 +95,15 @@ impl FeatureSpec {
 
     /// Width of a node's features.
     pub fn node_width(&self) -> usize {
-        2 * self.dims + self.extras + if self.pushes() { self.dims } else { 0 }
+        2 * self.dims + self.agent_state + if self.pushes() { self.dims } else { 0 }
     }
 
     /// Width of an agent's goal features.
     pub fn goal_width(&self) -> usize {
-        self.extras
+        self.agent_state
             + match (self.relative_goal, self.pushes()) {
-                (false, _) => (2 + self.targets) * self.dims,
-                (true, false) => self.dims + self.targets * (2 * self.dims + 1),
+                (false, _) => (2 + self.goals_per_agent) * self.dims,
+                (true, false) => self.dims + self.goals_per_agent * (2 * self.dims + 1),
                 (true, true) => goal::push_width(self.dims),
             }
     }
@@ -116,7 +116,7 @@ impl FeatureSpec {
 
     /// Whether an agent's way leads to a ball and with it to a landmark.
     fn pushes(&self) -> bool {
-        self.balls > 0 && self.targets == 2
+        self.balls > 0 && self.goals_per_agent == 2
     }
 
     /// E.
@@ -128,7 +128,7 @@ impl FeatureSpec {
     pub fn compute(&self, states: &JointStates<'_>) -> Features {
         let (n, d, joint) = (self.agents, self.dims, self.bodies() * self.dims);
         let count = states.positions.len() / joint;
-        let episodes = states.goals.len() / (n * self.targets);
+        let episodes = states.goals.len() / (n * self.goals_per_agent);
         let mut out = Features::default();
         out.goals.reserve(count * n * self.goal_width());
         if self.neighbours > 0 {
@@ -145,12 +145,12 @@ impl FeatureSpec {
             let state = State {
                 p: &states.positions[s * joint..(s + 1) * joint],
                 v: &states.velocities[s * joint..(s + 1) * joint],
-                extras: &states.extras[s * n * self.extras..(s + 1) * n * self.extras],
+                agent_state: &states.agent_state[s * n * self.agent_state..(s + 1) * n * self.agent_state],
                 landmarks: &states.landmarks[episode * self.landmarks * d..(episode + 1) * self.landmarks * d],
-                goals: &states.goals[episode * n * self.targets..(episode + 1) * n * self.targets],
+                goals: &states.goals[episode * n * self.goals_per_agent..(episode + 1) * n * self.goals_per_agent],
                 dims: d,
                 agents: n,
-                targets: self.targets,
+                goals_per_agent: self.goals_per_agent,
             };
             symmetries.clear();
             symmetries.extend((0..n).map(|i| self.symmetry(&state, i)));
@@ -199,7 +199,7 @@ impl FeatureSpec {
         match self.observation.frame {
             Frame::World => Symmetry::default(),
             Frame::Push => {
-                let (ball, landmark) = (state.target(i, 0), state.target(i, self.targets - 1));
+                let (ball, landmark) = (state.target(i, 0), state.target(i, self.goals_per_agent - 1));
                 Symmetry::facing(offset(ball, landmark).0, offset(state.position(i), ball).0)
             }
         }
@@ -213,14 +213,14 @@ struct State<'a> {
     /// [E, D]
     v: &'a [f32],
     /// [N, X]
-    extras: &'a [f32],
+    agent_state: &'a [f32],
     /// [G, D]
     landmarks: &'a [f32],
     /// [N, K]
     goals: &'a [u32],
     dims: usize,
     agents: usize,
-    targets: usize,
+    goals_per_agent: usize,
 }
 
 impl<'a> State<'a> {
@@ -233,18 +233,18 @@ impl<'a> State<'a> {
     }
 
     fn extra(&self, agent: usize) -> &'a [f32] {
-        let width = self.extras.len() / self.agents;
-        &self.extras[agent * width..(agent + 1) * width]
+        let width = self.agent_state.len() / self.agents;
+        &self.agent_state[agent * width..(agent + 1) * width]
     }
 
     /// Index of an agent's k-th goal within its group.
     fn goal(&self, agent: usize, k: usize) -> usize {
-        self.goals[agent * self.targets + k] as usize
+        self.goals[agent * self.goals_per_agent + k] as usize
     }
 
     /// The body that is an agent's k-th target; `None` if that is a landmark, which the last one always is.
     fn target_body(&self, agent: usize, k: usize) -> Option<usize> {
-        (k + 1 < self.targets).then(|| self.agents + self.goal(agent, k))
+        (k + 1 < self.goals_per_agent).then(|| self.agents + self.goal(agent, k))
     }
 
     fn target(&self, agent: usize, k: usize) -> &'a [f32] {

@@ -146,7 +146,7 @@ fn keyed_noise_is_replayed_and_makes_edges_random() {
 struct States {
     positions: Vec<f32>,
     velocities: Vec<f32>,
-    extras: Vec<f32>,
+    agent_state: Vec<f32>,
     landmarks: Vec<f32>,
     goals: Vec<u32>,
 }
@@ -154,11 +154,11 @@ struct States {
 impl States {
     fn new(task: &TaskConfig, count: usize) -> Self {
         let s = task.shape(count);
-        let goals = |_| (0..s.agents as u32).flat_map(|i| std::iter::repeat_n(i, s.targets));
+        let goals = |_| (0..s.agents as u32).flat_map(|i| std::iter::repeat_n(i, s.goals_per_agent));
         Self {
             positions: normal(count * s.bodies * s.dims, 1),
             velocities: normal(count * s.bodies * s.dims, 2),
-            extras: normal(count * s.agents * s.extras, 4).iter().map(|x| -x.abs()).collect(),
+            agent_state: normal(count * s.agents * s.agent_state, 4).iter().map(|x| -x.abs()).collect(),
             landmarks: normal(count * s.landmarks * s.dims, 3),
             goals: (0..count).flat_map(goals).collect(),
         }
@@ -170,9 +170,9 @@ impl States {
         JointStates {
             positions: &self.positions[from * state..to * state],
             velocities: &self.velocities[from * state..to * state],
-            extras: &self.extras[from * s.agents * s.extras..to * s.agents * s.extras],
+            agent_state: &self.agent_state[from * s.agents * s.agent_state..to * s.agents * s.agent_state],
             landmarks: &self.landmarks[from * s.landmarks * s.dims..to * s.landmarks * s.dims],
-            goals: &self.goals[from * s.agents * s.targets..to * s.agents * s.targets],
+            goals: &self.goals[from * s.agents * s.goals_per_agent..to * s.agents * s.goals_per_agent],
         }
     }
 }

@@ -17,6 +17,7 @@ pub mod security;
 pub mod server;
 pub mod shutdown;
 pub mod status;
+pub mod sync;
 pub mod telemetry;
 pub mod tls;
 pub mod trace;

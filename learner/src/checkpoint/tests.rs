@@ -1,6 +1,6 @@
 use super::*;
-use crate::commander::CommanderPpo;
-use crate::mappo::Mappo;
+use crate::train::commander_ppo::CommanderPpo;
+use crate::train::mappo::Mappo;
 use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
 use magex_core::task::{Spawn, TaskConfig};
 

@@ -31,11 +31,11 @@ function makeScene(canvas, data) {
   // Everything a step shows is computed once per episode from the states.
   function load(source) {
     const { steps, agents, bodies, landmarks, dims, targets } = source;
-    const [positions, places, extras] = [source.positions, source.landmarks_at, source.extra_values].map(text => decode(text, source.wide));
+    const [positions, places, agent_state] = [source.positions, source.landmarks_at, source.extra_values].map(text => decode(text, source.wide));
     const e = { ...source, covered: [], share: [], contact: [], pushed: [], distances: [], lost: [], touches: [0], arrival: null };
     e.at = (t, i, d) => d < dims ? positions[(t * bodies + i) * dims + d] : 0;
     e.place = (k, d) => d < dims ? places[k * dims + d] : 0;
-    e.extra = (t, i, x) => extras[(t * agents + i) * source.extras + x];
+    e.extra = (t, i, x) => agent_state[(t * agents + i) * source.agent_state + x];
     e.out = (t, i) => data.out !== null && e.extra(t, i, data.out) > 0.5;
     e.first = group => group === "balls" ? agents : 0;
     // The k-th of agent i's chain, as an index into its group.
@@ -134,7 +134,7 @@ function makeScene(canvas, data) {
     const mix = (read, i, d) => read(t0, i, d) * (1 - part) + read(t1, i, d) * part;
     const now = { t0, part, bodies: [], states: [] };
     for (let i = 0; i < e.bodies; i++) now.bodies.push([0, 1, 2].map(d => mix(e.at, i, d)));
-    for (let i = 0; i < e.agents; i++) now.states.push(Array.from({ length: e.extras }, (_, x) => mix(e.extra, i, x)));
+    for (let i = 0; i < e.agents; i++) now.states.push(Array.from({ length: e.agent_state }, (_, x) => mix(e.extra, i, x)));
     const c = Object.fromEntries(["line", "agent", "trail", "ball", "ball-trail", "goal", "covered", "crash", "link", "ink", "map", "soft"].map(name => [name, color(`--${name}`)]));
     for (const pane of panes) {
       g.save();

@@ -52,11 +52,11 @@ pub struct Scene {
     /// The groups from the agents to the landmarks, K + 1 of them: the k-th goal of an agent is a member of entry k + 1.
     #[serde(serialize_with = "group_names")]
     pub chain: Vec<Group>,
-    /// Which of an agent's extras begin its target velocity.
+    /// Which of an agent's agent_state begin its target velocity.
     pub target_velocity: Option<usize>,
-    /// Which of an agent's extras are x and y of its upward axis; the first of the two.
+    /// Which of an agent's agent_state are x and y of its upward axis; the first of the two.
     pub up: Option<usize>,
-    /// Which of an agent's extras says (by 1) that it crashed: it covers nothing any more.
+    /// Which of an agent's agent_state says (by 1) that it crashed: it covers nothing any more.
     pub out: Option<usize>,
     /// [`UNIT`].
     pub unit: f64,
@@ -77,11 +77,11 @@ impl Scene {
             length_unit: if flies { "metres" } else { "world units" },
             agent_name: if flies { "drone" } else { "agent" },
             out_name: "crashed",
-            agent_radius: seen.contact / 2.0,
+            agent_radius: seen.contact_radius / 2.0,
             ball_radius: 0.15,
             landmark_radius,
-            contact_distance: seen.contact,
-            cover_radius: seen.reached,
+            contact_distance: seen.contact_radius,
+            cover_radius: seen.success_radius,
             step_seconds,
             ground: flies.then_some(0.0),
             chain: stages.iter().take(1).map(|stage| stage.from).chain(stages.iter().map(|stage| stage.to)).collect(),
@@ -92,8 +92,8 @@ impl Scene {
         }
     }
 
-    /// How many of an agent's extras the script reads.
-    pub fn extras(&self) -> usize {
+    /// How many of an agent's agent_state the script reads.
+    pub fn agent_state(&self) -> usize {
         let ends = [self.target_velocity.map(|x| x + 3), self.up.map(|x| x + 2), self.out.map(|x| x + 1)];
         ends.into_iter().flatten().max().unwrap_or(0)
     }
@@ -117,11 +117,11 @@ impl Scene {
             bodies: shape.bodies,
             landmarks: shape.landmarks,
             dims: shape.dims,
-            extras: shape.extras,
-            targets: shape.targets,
+            agent_state: shape.agent_state,
+            goals_per_agent: shape.goals_per_agent,
             wide,
             positions: pack(&recording.positions, wide),
-            extra_values: pack(&recording.extras, wide),
+            extra_values: pack(&recording.agent_state, wide),
             landmarks_at: pack(&recording.landmarks, wide),
             goals: &recording.goals,
             facts: metrics.map(|metrics| self.facts(metrics)).unwrap_or_default(),
@@ -132,23 +132,26 @@ impl Scene {
     fn check(&self, recording: &Recording) -> Result<bool, SceneError> {
         let shape = &recording.shape;
         let wrong = |field, reason| SceneError { field, reason };
-        if shape.agents == 0 || shape.dims == 0 || shape.targets == 0 || shape.bodies < shape.agents {
+        if shape.agents == 0 || shape.dims == 0 || shape.goals_per_agent == 0 || shape.bodies < shape.agents {
             let reason = "agents, dims and targets must be at least 1 and bodies as many as agents";
             return Err(wrong("shape", reason.to_owned()));
         }
-        if shape.targets + 1 != self.chain.len() {
+        if shape.goals_per_agent + 1 != self.chain.len() {
             let expected = self.chain.len().saturating_sub(1);
             return Err(wrong(
                 "shape",
-                format!("targets is {}, the task assigns {expected} to an agent", shape.targets),
+                format!("goals_per_agent is {}, the task assigns {expected} to an agent", shape.goals_per_agent),
             ));
         }
-        if shape.extras < self.extras() {
-            return Err(wrong("shape", format!("extras is {}, the task has {} or more", shape.extras, self.extras())));
+        if shape.agent_state < self.agent_state() {
+            return Err(wrong(
+                "shape",
+                format!("agent_state is {}, the task has {} or more", shape.agent_state, self.agent_state()),
+            ));
         }
         let floats = [
             ("positions", &recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
-            ("extras", &recording.extras, (shape.steps + 1) * shape.agents * shape.extras),
+            ("agent_state", &recording.agent_state, (shape.steps + 1) * shape.agents * shape.agent_state),
             ("landmarks", &recording.landmarks, shape.landmarks * shape.dims),
         ];
         let mut wide = false;
@@ -161,12 +164,12 @@ impl Scene {
             }
             wide |= values.iter().any(|&x| quantised(x).abs() > i32::from(i16::MAX));
         }
-        if recording.goals.len() != shape.agents * shape.targets {
-            let expected = shape.agents * shape.targets;
+        if recording.goals.len() != shape.agents * shape.goals_per_agent {
+            let expected = shape.agents * shape.goals_per_agent;
             return Err(wrong("goals", format!("{} entries, the shape asks for {expected}", recording.goals.len())));
         }
         for (place, &goal) in recording.goals.iter().enumerate() {
-            let group = self.chain[place % shape.targets + 1];
+            let group = self.chain[place % shape.goals_per_agent + 1];
             let members = match group {
                 Group::Agents => shape.agents,
                 Group::Balls => shape.bodies - shape.agents,
@@ -204,8 +207,8 @@ pub struct PackedEpisode<'a> {
     bodies: usize,
     landmarks: usize,
     dims: usize,
-    extras: usize,
-    targets: usize,
+    agent_state: usize,
+    goals_per_agent: usize,
     /// 32-bit instead of 16-bit numbers.
     wide: bool,
     /// `[T+1, E, D]`, base64 of little-endian whole multiples of the unit.
@@ -296,7 +299,7 @@ mod tests {
         for name in [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones] {
             let (task, scene) = (TaskConfig::of(name, 5, Spawn::Uniform), scene(name));
             assert_eq!(scene.chain.len(), task.stages().len() + 1, "{name}");
-            assert_eq!((scene.extras(), scene.side), (task.extras(), task.side), "{name}");
+            assert_eq!((scene.agent_state(), scene.side), (task.agent_state(), task.side), "{name}");
         }
     }
 

@@ -2,7 +2,6 @@
 
 use super::curve::Curve;
 use super::scene::Scene;
-use crate::state::lock;
 use crate::trainer::{Outcome, TrainError};
 use axum::body::Bytes;
 use magex_core::config::RunConfig;
@@ -10,6 +9,7 @@ use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1;
 use magex_proto::weights::Weights;
+use magex_runtime::sync::lock;
 use serde_json::{Value, json};
 use std::io::BufRead as _;
 use std::path::Path;

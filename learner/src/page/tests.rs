@@ -1,7 +1,7 @@
 //! The page over a real socket, as a browser would ask for it.
 
 use super::*;
-use crate::collector::StopReason;
+use crate::run_events::StopReason;
 use crate::trainer::Outcome;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
@@ -70,8 +70,17 @@ fn line(iteration: u32) -> String {
 }
 
 fn outcome(version: u32, record: bool) -> EvalOutcome {
-    let shape =
-        Shape { steps: 1, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, extras: 0, targets: 1, heads: 1 };
+    let shape = Shape {
+        steps: 1,
+        episodes: 1,
+        agents: 2,
+        bodies: 2,
+        landmarks: 2,
+        dims: 2,
+        agent_state: 0,
+        goals_per_agent: 1,
+        action_components: 1,
+    };
     let shard = Shard {
         kind: ShardKind::Eval,
         iteration: Iteration(version),
@@ -86,7 +95,7 @@ fn outcome(version: u32, record: bool) -> EvalOutcome {
     let recording = Recording {
         shape,
         positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
-        extras: vec![],
+        agent_state: vec![],
         landmarks: vec![0.5, 0.0, 1.0, 0.0],
         goals: vec![0, 1],
     };

@@ -3,7 +3,8 @@
 use super::{TrainError, Trainer};
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::checkpoint::{self, Progress};
-use crate::collector::{Collector, RunEvent, StopReason};
+use crate::collector::Collector;
+use crate::run_events::{RunEvent, StopReason};
 use magex_core::ids::Iteration;
 use magex_runtime::backoff::Backoff;
 use magex_runtime::trace;

@@ -49,9 +49,9 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
             bodies: e,
             landmarks: n,
             dims: d,
-            extras: extra,
-            targets: k,
-            heads: h,
+            agent_state: extra,
+            goals_per_agent: k,
+            action_components: h,
         };
         let state = (t + 1) * b * e * d;
         let states = (floats(state), floats(state), floats(b * n * d), floats((t + 1) * b * n * extra));
@@ -64,7 +64,7 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
             positions: states.0,
             velocities: states.1,
             landmarks: states.2,
-            extras: states.3,
+            agent_state: states.3,
             goals: choices.0,
             actions: choices.1,
             log_probs: numbers.0,
@@ -96,8 +96,8 @@ proptest! {
 
     #[test]
     fn an_evaluation_round_trips(shard in shards(), metrics in metrics(3), points in floats(3 * 2 * 2)) {
-        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, extras: 0, targets: 1, heads: 1 };
-        let recording = Recording { shape, landmarks: points[..4].to_vec(), positions: points, extras: vec![], goals: vec![1, 0] };
+        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, agent_state: 0, goals_per_agent: 1, action_components: 1 };
+        let recording = Recording { shape, landmarks: points[..4].to_vec(), positions: points, agent_state: vec![], goals: vec![1, 0] };
         let outcome = ShardResult::Eval(EvalOutcome { shard, metrics, recording: shard.record.then_some(recording) });
         prop_assert_eq!(decode_result(encode_result(&RunId("r".into()), "abc", &outcome)).unwrap().result, outcome);
     }
@@ -126,9 +126,9 @@ fn a_wrong_field_is_named_by_its_path() {
         bodies: 1,
         landmarks: 1,
         dims: 2,
-        extras: 0,
-        targets: 1,
-        heads: 1,
+        agent_state: 0,
+        goals_per_agent: 1,
+        action_components: 1,
     };
     let body = v1::Trajectory {
         shape: Some(shape),

@@ -7,9 +7,9 @@ use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint::{self, Learned, Progress, sha256_hex};
-use magex_learner::commander::CommanderPpo;
-use magex_learner::ingest::{Limits, admit};
-use magex_learner::mappo::Mappo;
+use magex_learner::serve::validate::{Limits, admit};
+use magex_learner::train::commander_ppo::CommanderPpo;
+use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
 /// A run whose files are damaged.

@@ -4,7 +4,8 @@ use crate::sandbox::*;
 use magex_actor::run::ActorError;
 use magex_actor::worker::WorkError;
 use magex_core::ids::Shard;
-use magex_learner::collector::{CollectError, Collector as _};
+use magex_learner::collector::Collector as _;
+use magex_learner::run_events::CollectError;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 

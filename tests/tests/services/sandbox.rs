@@ -12,9 +12,12 @@ use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
-use magex_learner::collector::{CollectError, Collector, GrpcCollector};
-use magex_learner::ingest::Limits;
-use magex_learner::service::{LearnerHandle, RunIdentity, learner_service};
+use magex_learner::collector::Collector;
+use magex_learner::run_events::CollectError;
+use magex_learner::run_identity::RunIdentity;
+use magex_learner::serve::grpc_collector::GrpcCollector;
+use magex_learner::serve::service::{LearnerHandle, learner_service};
+use magex_learner::serve::validate::Limits;
 use magex_proto::convert::encode_result;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
@@ -86,7 +89,7 @@ pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> Sha
         shape,
         positions: numbers((t + 1) * b * n * 2),
         velocities: numbers((t + 1) * b * n * 2),
-        extras: vec![],
+        agent_state: vec![],
         landmarks: numbers(b * n * 2),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],

@@ -6,7 +6,7 @@ use magex_core::ids::{RunId, Shard};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::collector::Collector as _;
-use magex_learner::ingest::{Limits, admit};
+use magex_learner::serve::validate::{Limits, admit};
 use magex_proto::convert::encode_result;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;

@@ -2,7 +2,8 @@
 
 use crate::sandbox::*;
 use magex_core::ids::Iteration;
-use magex_learner::collector::{CollectError, Collector as _, IterationReport, RunEvent, StopReason};
+use magex_learner::collector::Collector as _;
+use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
 use magex_proto::v1;
 use magex_proto::v1::watch_run_response::Event;
 use std::time::{Duration, Instant};

@@ -3,7 +3,8 @@
 use crate::sandbox::*;
 use bytes::Bytes;
 use magex_core::ids::{RunId, WeightsVersion};
-use magex_learner::collector::{CollectError, Collector as _};
+use magex_learner::collector::Collector as _;
+use magex_learner::run_events::CollectError;
 use magex_proto::v1;
 use magex_proto::weights::{Weights, WeightsAssembler};
 use std::sync::Arc;

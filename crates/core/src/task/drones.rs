@@ -60,7 +60,7 @@ impl Default for DroneConfig {
 
 impl DroneConfig {
     /// Target velocity (3), x and y of the body's up axis (2), out of the episode (1).
-    pub const EXTRAS: usize = 6;
+    pub const AGENT_STATE: usize = 6;
     /// Commands per second.
     pub const COMMANDS_HZ: u32 = 30;
     /// Gain of the attitude controller's rate loop, per second: at one call per physics step it chatters where the gain
@@ -70,11 +70,11 @@ impl DroneConfig {
 
 pub(super) fn observation() -> Observation {
     Observation {
-        reach: 1.5,
-        reached: 0.15,
-        contact: 0.12,
+        sensing_radius: 1.5,
+        success_radius: 0.15,
+        contact_radius: 0.12,
         encounters: true,
-        out: Some(DroneConfig::EXTRAS - 1),
+        out: Some(DroneConfig::AGENT_STATE - 1),
         ..Observation::default()
     }
 }

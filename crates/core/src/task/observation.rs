@@ -18,18 +18,18 @@ pub struct Observation {
     /// Unit of velocities, world units per second.
     pub speed: f32,
     /// Within this distance the direction to a target fades, so that it has no jump at the target.
-    pub near: f32,
+    pub fade_radius: f32,
     /// Bodies farther than this are not seen as neighbours.
-    pub reach: f32,
+    pub sensing_radius: f32,
     /// Distance at which the last target counts as reached.
-    pub reached: f32,
+    pub success_radius: f32,
     /// Distance at which two agents touch.
-    pub contact: f32,
+    pub contact_radius: f32,
     /// The axes that an agent sees the world along.
     pub frame: Frame,
     /// Neighbours are seen with the time and the offset of their closest approach, by every executor but the literal one.
     pub encounters: bool,
-    /// Which of an agent's extras says (by 1) that it is out of the episode: others do not see it any more.
+    /// Which of an agent's agent_state says (by 1) that it is out of the episode: others do not see it any more.
     pub out: Option<usize>,
 }
 
@@ -38,10 +38,10 @@ impl Default for Observation {
     fn default() -> Self {
         Self {
             speed: 2.0,
-            near: 0.3,
-            reach: 1.0,
-            reached: 0.15,
-            contact: 0.2,
+            fade_radius: 0.3,
+            sensing_radius: 1.0,
+            success_radius: 0.15,
+            contact_radius: 0.2,
             frame: Frame::World,
             encounters: false,
             out: None,

@@ -3,7 +3,7 @@
 use super::{Frame, Observation, Spawn, TaskConfig, coefficients};
 use serde::{Deserialize, Serialize};
 
-/// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + arc · θ ·
+/// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + turn_length · θ ·
 /// min(1, d_bl / 0.3), d_ab the distance agent–ball, d_bl ball–landmark, θ the angle between the two legs:
 /// r = progress · (Φ' − Φ) + bonus · 1\[d_bl ≤ 0.3\] − distance · (d_ab + d_bl).
 ///
@@ -14,19 +14,19 @@ pub struct PushBallConfig {
     /// Paid per unit of way made good.
     pub progress: f32,
     /// World units per radian that the ball must be walked around.
-    pub arc: f32,
+    pub turn_length: f32,
     /// Paid on every step on which the ball is within 0.3 of its landmark.
     pub bonus: f32,
     /// Charged per unit of distance left, on every step.
     pub distance: f32,
     /// Share of the training episodes in which agents start exactly in line with their balls, on the landmarks' side: starts
     /// that random positions never show, and fixed layouts do.
-    pub aligned: f32,
+    pub start_in_line_fraction: f32,
 }
 
 impl Default for PushBallConfig {
     fn default() -> Self {
-        Self { progress: 2.0, arc: 0.25, bonus: 0.1, distance: 0.0, aligned: 0.3 }
+        Self { progress: 2.0, turn_length: 0.25, bonus: 0.1, distance: 0.0, start_in_line_fraction: 0.3 }
     }
 }
 
@@ -34,17 +34,17 @@ impl Default for PushBallConfig {
 const SPACING: f32 = 0.3;
 
 pub(super) fn observation() -> Observation {
-    Observation { reach: 1.5, reached: 0.3, frame: Frame::Push, ..Observation::default() }
+    Observation { sensing_radius: 1.5, success_radius: 0.3, frame: Frame::Push, ..Observation::default() }
 }
 
 pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
     let p = &task.push_ball;
     coefficients(
         "task.push_ball",
-        &[("progress", p.progress), ("arc", p.arc), ("bonus", p.bonus), ("distance", p.distance)],
+        &[("progress", p.progress), ("turn_length", p.turn_length), ("bonus", p.bonus), ("distance", p.distance)],
     )?;
-    if !(0.0..=1.0).contains(&p.aligned) {
-        return Err(format!("task.push_ball.aligned: {} is outside 0..=1", p.aligned));
+    if !(0.0..=1.0).contains(&p.start_in_line_fraction) {
+        return Err(format!("task.push_ball.start_in_line_fraction: {} is outside 0..=1", p.start_in_line_fraction));
     }
     // The balls of the authors' layouts, on their longest line, in raw units apart.
     let gap = match task.agents {

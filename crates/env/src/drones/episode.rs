@@ -146,7 +146,7 @@ impl Episode {
     }
 
     /// `[N, 6]`: see [`super::Drones`].
-    pub(super) fn extras(&self) -> impl Iterator<Item = [f32; DroneConfig::EXTRAS]> + '_ {
+    pub(super) fn agent_state(&self) -> impl Iterator<Item = [f32; DroneConfig::AGENT_STATE]> + '_ {
         self.world.drones.iter().zip(&self.targets).map(|(drone, target)| {
             let [vx, vy, vz] = target.map(|c| c as f32);
             let r = drone.motion.pose.rotation;

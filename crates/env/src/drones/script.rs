@@ -18,7 +18,7 @@ pub fn scripted_drones(view: &View<'_>, agents: usize, out: &mut [u8]) -> Result
     let numbers = states * agents;
     check_len("positions", view.positions.len(), 3 * numbers)?;
     check_len("actions", out.len(), 3 * numbers)?;
-    check_len("extras", view.extras.len(), DroneConfig::EXTRAS * numbers)?;
+    check_len("agent_state", view.agent_state.len(), DroneConfig::AGENT_STATE * numbers)?;
     check_len("landmarks", view.landmarks.len(), 3 * view.goals.len())?;
     // Q episodes, at least one.
     check_len("goals", view.goals.len(), view.goals.len().max(1).next_multiple_of(agents.max(1)))?;
@@ -31,7 +31,7 @@ pub fn scripted_drones(view: &View<'_>, agents: usize, out: &mut [u8]) -> Result
         for (d, action) in actions.iter_mut().enumerate() {
             let way = f64::from(view.landmarks[landmark + d]) - f64::from(view.positions[3 * k + d]);
             let wanted = (APPROACH * way).clamp(-MOST_SPEED, MOST_SPEED);
-            let missing = wanted - f64::from(view.extras[DroneConfig::EXTRAS * k + d]);
+            let missing = wanted - f64::from(view.agent_state[DroneConfig::AGENT_STATE * k + d]);
             *action = nearest(missing);
         }
     }

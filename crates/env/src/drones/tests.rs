@@ -31,18 +31,21 @@ fn episode(task: &TaskConfig, positions: &[[f32; 3]], velocities: &[[f32; 3]]) -
 struct Seen {
     positions: Vec<f32>,
     velocities: Vec<f32>,
-    extras: Vec<f32>,
+    agent_state: Vec<f32>,
     rewards: Vec<f32>,
 }
 
 impl Seen {
     fn bits(&self) -> Vec<u32> {
-        let all = [&self.positions, &self.velocities, &self.extras, &self.rewards];
+        let all = [&self.positions, &self.velocities, &self.agent_state, &self.rewards];
         all.into_iter().flatten().map(|value| value.to_bits()).collect()
     }
 
     fn finite(&self) -> bool {
-        [&self.positions, &self.velocities, &self.extras, &self.rewards].into_iter().flatten().all(|v| v.is_finite())
+        [&self.positions, &self.velocities, &self.agent_state, &self.rewards]
+            .into_iter()
+            .flatten()
+            .all(|v| v.is_finite())
     }
 }
 
@@ -51,13 +54,13 @@ fn step(drones: &mut Drones, actions: &[u8]) -> Seen {
     let mut seen = Seen {
         positions: vec![0.0; 3 * numbers],
         velocities: vec![0.0; 3 * numbers],
-        extras: vec![0.0; 6 * numbers],
+        agent_state: vec![0.0; 6 * numbers],
         rewards: vec![0.0; numbers],
     };
     drones.step(actions, &mut seen.rewards).unwrap();
     drones.write_positions(&mut seen.positions).unwrap();
     drones.write_velocities(&mut seen.velocities).unwrap();
-    drones.write_extras(&mut seen.extras).unwrap();
+    drones.write_agent_state(&mut seen.agent_state).unwrap();
     seen
 }
 
@@ -83,13 +86,13 @@ fn actions_move_the_target_velocity_and_the_drone_follows() {
     let mut drones = episode(&task(1), &[[0.0, 0.0, 1.5]], &[[0.0; 3]]);
     let seen = step(&mut drones, &[0, 1, 2]);
     let change = 5.0 / 30.0;
-    for (target, expected) in seen.extras.iter().zip([change, 0.0, -change]) {
+    for (target, expected) in seen.agent_state.iter().zip([change, 0.0, -change]) {
         assert!((target - expected).abs() < 1e-6, "{seen:?}");
     }
     // Twelve commands to full speed, and never beyond 2 m/s in all.
     let seen = (0..30).map(|_| step(&mut drones, &[0, 0, 1])).last().unwrap();
     let speed = |v: &[f32]| libm::sqrtf(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
-    assert!((speed(&seen.extras[..3]) - 2.0).abs() < 1e-5, "{seen:?}");
+    assert!((speed(&seen.agent_state[..3]) - 2.0).abs() < 1e-5, "{seen:?}");
     // The drag leaves a standing error.
     assert!((speed(&seen.velocities) - 2.0).abs() < 0.15, "{seen:?}");
     assert!(seen.velocities[0] > 1.0 && seen.velocities[1] > 1.0, "{seen:?}");
@@ -104,15 +107,15 @@ fn scripted(task: &TaskConfig, episodes: u32) -> (Drones, [f32; 2]) {
     let numbers = drones.numbers();
     let landmarks = drones.landmarks().to_vec();
     let (mut positions, mut velocities) = (vec![0.0; 3 * numbers], vec![0.0; 3 * numbers]);
-    let (mut extras, mut actions) = (vec![0.0; 6 * numbers], vec![1; 3 * numbers]);
+    let (mut agent_state, mut actions) = (vec![0.0; 6 * numbers], vec![1; 3 * numbers]);
     for _ in 0..task.horizon {
         drones.write_positions(&mut positions).unwrap();
         drones.write_velocities(&mut velocities).unwrap();
-        drones.write_extras(&mut extras).unwrap();
+        drones.write_agent_state(&mut agent_state).unwrap();
         let view = View {
             positions: &positions,
             velocities: &velocities,
-            extras: &extras,
+            agent_state: &agent_state,
             landmarks: &landmarks,
             goals: &goals,
         };
@@ -292,7 +295,7 @@ fn mistakes_are_named() {
     assert!(text(drones.step(&[1, 1, 1, 1, 3, 1], &mut [0.0; 2])).contains("actions[4]: 3"));
     assert!(text(drones.step(&[1; 5], &mut [0.0; 2])).contains("actions: 5"));
     assert!(text(drones.step(&[1; 6], &mut [0.0; 3])).contains("rewards: 3"));
-    assert!(text(drones.write_extras(&mut [0.0; 11])).contains("extras"));
+    assert!(text(drones.write_agent_state(&mut [0.0; 11])).contains("agent_state"));
     assert_eq!(drones.steps(), 0);
     let refused =
         |positions: &[f32]| Drones::from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
@@ -350,7 +353,7 @@ proptest! {
             for (b, drones) in alone.iter_mut().enumerate() {
                 let own = step(drones, &actions[6 * b..6 * (b + 1)]);
                 prop_assert_eq!(&all.positions[6 * b..6 * (b + 1)], &own.positions[..]);
-                prop_assert_eq!(&all.extras[12 * b..12 * (b + 1)], &own.extras[..]);
+                prop_assert_eq!(&all.agent_state[12 * b..12 * (b + 1)], &own.agent_state[..]);
                 prop_assert_eq!(&all.rewards[2 * b..2 * (b + 1)], &own.rewards[..]);
             }
         }
@@ -371,7 +374,7 @@ proptest! {
             let (a, b) = (step(&mut a, actions), step(&mut b, &permuted));
             for i in 0..4 {
                 prop_assert_eq!(&b.positions[3 * i..3 * i + 3], &a.positions[3 * turn(i)..3 * turn(i) + 3]);
-                prop_assert_eq!(&b.extras[6 * i..6 * i + 6], &a.extras[6 * turn(i)..6 * turn(i) + 6]);
+                prop_assert_eq!(&b.agent_state[6 * i..6 * i + 6], &a.agent_state[6 * turn(i)..6 * turn(i) + 6]);
             }
         }
     }

@@ -35,7 +35,7 @@ impl<R: Real> Law<R> {
         let reached = R::from_f64(REACHED);
         Self {
             progress: R::from_f64(f64::from(config.progress)),
-            arc: R::from_f64(f64::from(config.arc)),
+            arc: R::from_f64(f64::from(config.turn_length)),
             bonus: R::from_f64(f64::from(config.bonus)),
             distance: R::from_f64(f64::from(config.distance)),
             push: R::from_f64(PUSH_DISTANCE),

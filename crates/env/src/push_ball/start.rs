@@ -29,14 +29,14 @@ pub struct Start {
 }
 
 /// Draws the start of an episode from its own stream. What `training` may add is drawn last, so that the same stream
-/// gives an evaluation episode the same start whatever `task.push_ball.aligned` is.
+/// gives an evaluation episode the same start whatever `task.push_ball.start_in_line_fraction` is.
 pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Start {
     let mut start = match task.spawn {
         Spawn::Uniform => uniform(task.agents, task.side, stream),
         Spawn::Lines(fixed) => on_layout(task, fixed, JITTER, stream),
         Spawn::Authors(fixed) => on_layout(task, fixed, 0.0, stream),
     };
-    if training && stream.uniform() < f64::from(task.push_ball.aligned) {
+    if training && stream.uniform() < f64::from(task.push_ball.start_in_line_fraction) {
         align(&mut start, task.side, stream);
     }
     start

@@ -302,7 +302,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(env.step(&[0; 9], &mut rewards).is_err());
     assert!(env.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(env.write_positions(&mut [0.0; 20]).is_err() && env.write_velocities(&mut [0.0; 41]).is_err());
-    assert!(env.write_extras(&mut [0.0]).is_err() && env.write_extras(&mut []).is_ok());
+    assert!(env.write_agent_state(&mut [0.0]).is_err() && env.write_agent_state(&mut []).is_ok());
     assert_eq!((env.positions(), env.steps()), (before, 0));
     for _ in 0..task.horizon {
         env.step(&[0; 10], &mut rewards).unwrap();
@@ -314,8 +314,13 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 19, .. })));
     assert!(PushBall::from_state(&task, &[0.0; 10], &[0.0; 20], &[0.0; 10]).is_err());
     let mut task = task;
-    task.push_ball.aligned = 1.5;
-    assert!(PushBall::new(&task, streams(1), true).unwrap_err().to_string().contains("task.push_ball.aligned"));
+    task.push_ball.start_in_line_fraction = 1.5;
+    assert!(
+        PushBall::new(&task, streams(1), true)
+            .unwrap_err()
+            .to_string()
+            .contains("task.push_ball.start_in_line_fraction")
+    );
 }
 
 #[test]

@@ -34,7 +34,7 @@ pub fn scripted_push_ball(view: &View<'_>, agents: usize, actions: &mut [u8]) ->
     check_len("actions", actions.len(), n * states.next_multiple_of(episodes.max(1)))?;
     check_len("positions", view.positions.len(), 4 * n * states)?;
     check_len("velocities", view.velocities.len(), 4 * n * states)?;
-    check_len("extras", view.extras.len(), 0)?;
+    check_len("agent_state", view.agent_state.len(), 0)?;
     if let Some(place) = view.goals.iter().position(|&goal| goal as usize >= n) {
         let goal = view.goals[place];
         return Err(match place % 2 {

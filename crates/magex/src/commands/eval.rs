@@ -10,7 +10,7 @@ use crate::settings;
 use magex_core::ids::Mode;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::EpisodeMetrics;
-use magex_learner::metrics::{EvalSummary, summarise};
+use magex_learner::report::metrics_file::{EvalSummary, summarise};
 use magex_runtime::exit;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;

@@ -15,7 +15,7 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
 use magex_learner::checkpoint::sha256_hex;
-use magex_learner::commander::{CommanderPpo, CommanderState, Lesson, Sample, cost, greedy_cost};
+use magex_learner::train::commander_ppo::{CommanderPpo, CommanderState, Lesson, Sample, cost, greedy_cost};
 use magex_nets::commander::Commander;
 use magex_nets::params::to_safetensors;
 use magex_runtime::exit;

@@ -15,7 +15,7 @@ impl FeatureSpec {
         out: &mut [f32],
         counts: &mut [u8],
     ) {
-        let (d, k, reach) = (self.dims, self.neighbours, self.observation.reach);
+        let (d, k, reach) = (self.dims, self.neighbours, self.observation.sensing_radius);
         let p = state.p;
         let width = self.neighbour_width();
         let gone = |j: usize| j < self.agents && self.observation.out.is_some_and(|flag| state.extra(j)[flag] > 0.0);
@@ -76,7 +76,7 @@ impl FeatureSpec {
             out[c] = offset[c];
             out[d + c] = velocity[c] / o.speed;
         }
-        out[2 * d] = (o.contact / square.sqrt().max(1e-6)).min(2.0);
+        out[2 * d] = (o.contact_radius / square.sqrt().max(1e-6)).min(2.0);
         let mut at = 2 * d + 1;
         if o.encounters {
             let (mut closing, mut speed) = (0.0f32, 0.0f32);
@@ -92,7 +92,7 @@ impl FeatureSpec {
                 out[at + c] = (2.0 * miss).clamp(-1.0, 1.0);
             }
             out[at + d] = time / AHEAD;
-            out[at + d + 1] = (o.contact / nearest.sqrt().max(1e-6)).min(2.0);
+            out[at + d + 1] = (o.contact_radius / nearest.sqrt().max(1e-6)).min(2.0);
             at += d + 2;
         }
         if self.balls > 0 {

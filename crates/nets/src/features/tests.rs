@@ -7,7 +7,7 @@ fn spec(neighbours: usize, agents: usize) -> FeatureSpec {
 }
 
 fn spread<'a>(positions: &'a [f32], velocities: &'a [f32], landmarks: &'a [f32], goals: &'a [u32]) -> JointStates<'a> {
-    JointStates { positions, velocities, extras: &[], landmarks, goals }
+    JointStates { positions, velocities, agent_state: &[], landmarks, goals }
 }
 
 #[test]
@@ -102,12 +102,12 @@ fn a_drone_sees_its_closest_approach_and_not_who_is_out() {
     let spec = FeatureSpec::new(&task, true, 4, true);
     let positions = [0.0, 0.0, 1.5, 1.0, 0.2, 1.5, 0.5, 0.0, 1.5];
     let velocities = [1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-    let mut extras = [0.0; 18];
-    extras[17] = 1.0;
+    let mut agent_state = [0.0; 18];
+    agent_state[17] = 1.0;
     let states = JointStates {
         positions: &positions,
         velocities: &velocities,
-        extras: &extras,
+        agent_state: &agent_state,
         landmarks: &[0.0; 9],
         goals: &[0, 1, 2],
     };

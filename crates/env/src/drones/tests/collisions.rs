@@ -140,8 +140,8 @@ fn a_drone_that_falls_crashes_on_the_ground_and_stays_there() {
         commands += 1;
     }
     assert_eq!(crash(&drones, 0), Some(Crash::Ground));
-    assert!(seen.rewards[0] < -9.0 && seen.extras[5] == 1.0, "{seen:?}");
-    assert_eq!((seen.extras[0], seen.extras[1], seen.extras[2]), (0.0, 0.0, 0.0));
+    assert!(seen.rewards[0] < -9.0 && seen.agent_state[5] == 1.0, "{seen:?}");
+    assert_eq!((seen.agent_state[0], seen.agent_state[1], seen.agent_state[2]), (0.0, 0.0, 0.0));
     for _ in 0..60 {
         seen = step(&mut drones, &down);
         assert_eq!(seen.rewards[0], 0.0);

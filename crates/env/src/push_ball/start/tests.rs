@@ -164,7 +164,7 @@ fn training_puts_agents_in_the_way_of_their_balls_as_often_as_asked() {
     for mode in [Spawn::Uniform, Spawn::Lines(None)] {
         for aligned in [0.0, 0.3, 1.0] {
             let mut task = task(if mode == Spawn::Uniform { 5 } else { 20 }, mode);
-            task.push_ball.aligned = aligned;
+            task.push_ball.start_in_line_fraction = aligned;
             let (mut episodes, mut agents) = (0, 0);
             for k in 0..1000 {
                 let plain = spawn(&task, false, &mut stream(k));
@@ -187,7 +187,7 @@ fn evaluation_starts_ignore_what_is_for_training() {
     for mode in [Spawn::Uniform, Spawn::Lines(None), Spawn::Authors(None)] {
         let plain = task(20, mode);
         let mut other = plain.clone();
-        other.push_ball.aligned = 1.0;
+        other.push_ball.start_in_line_fraction = 1.0;
         for k in 0..20 {
             assert_eq!(spawn(&plain, false, &mut stream(k)), spawn(&other, false, &mut stream(k)));
         }

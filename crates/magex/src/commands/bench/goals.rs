@@ -12,7 +12,7 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_env::spawn::{Start, spawn};
-use magex_learner::commander::{CommanderPpo, CommanderState, Sample, cost, greedy_cost};
+use magex_learner::train::commander_ppo::{CommanderPpo, CommanderState, Sample, cost, greedy_cost};
 use magex_nets::commander::{Commander, Team};
 use serde_json::json;
 use std::path::PathBuf;

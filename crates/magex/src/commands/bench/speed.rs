@@ -77,7 +77,7 @@ pub(super) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
     ] {
         let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
         config.executor.kind = kind;
-        config.mappo.minibatch = MINIBATCH;
+        config.mappo.minibatch_size = MINIBATCH;
         let rounds = if kind == ExecutorKind::Local { args.rounds } else { args.rounds.div_ceil(3) };
         let time = minibatch(&config, 8, rounds as usize)?;
         let cells = vec![

@@ -3,9 +3,11 @@
 
 use super::actors::Load;
 use anyhow::{Context as _, anyhow};
-use magex_learner::collector::{CollectError, Collector as _};
-use magex_learner::ingest::Limits;
-use magex_learner::service::{DEFAULT_LEASE, RunIdentity, learner_service};
+use magex_learner::collector::Collector as _;
+use magex_learner::run_events::CollectError;
+use magex_learner::run_identity::RunIdentity;
+use magex_learner::serve::service::{DEFAULT_LEASE, learner_service};
+use magex_learner::serve::validate::Limits;
 use magex_runtime::{process, server, shutdown};
 use rustix::process::{Pid, Signal, kill_process};
 use std::process::Stdio;

@@ -2,12 +2,13 @@
 
 mod results;
 
-use crate::ledger::{Lease, LeaseId, SessionId};
-use crate::state::{ActorEntry, Shared, lock};
+use crate::serve::ledger::{Lease, LeaseId, SessionId};
+use crate::serve::shared::{ActorEntry, Shared};
 use magex_proto::parts::Assembler;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::{PROTOCOL_VERSION, v1};
+use magex_runtime::sync::lock;
 use magex_runtime::{status, trace};
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -36,9 +36,9 @@ impl Batch {
                 bodies: 0,
                 landmarks: 0,
                 dims: 0,
-                extras: 0,
-                targets: 0,
-                heads: 0,
+                agent_state: 0,
+                goals_per_agent: 0,
+                action_components: 0,
             },
             |t| t.shape,
         );
@@ -48,7 +48,7 @@ impl Batch {
         let mut batch = Self {
             shape,
             features,
-            actions: Vec::with_capacity(rows * shape.heads),
+            actions: Vec::with_capacity(rows * shape.action_components),
             log_probs: Vec::with_capacity(rows),
             rewards: Vec::with_capacity(rows),
             noise: Vec::with_capacity(episodes.len()),
@@ -56,7 +56,9 @@ impl Batch {
         for (t, b) in &episodes {
             for step in 0..shape.steps {
                 let at = (step * t.shape.episodes + b) * shape.agents;
-                batch.actions.extend_from_slice(&t.actions[at * shape.heads..(at + shape.agents) * shape.heads]);
+                batch.actions.extend_from_slice(
+                    &t.actions[at * shape.action_components..(at + shape.agents) * shape.action_components],
+                );
                 batch.log_probs.extend_from_slice(&t.log_probs[at..at + shape.agents]);
                 batch.rewards.extend_from_slice(&t.rewards[at..at + shape.agents]);
             }
@@ -112,8 +114,8 @@ fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
     spec.compute(&JointStates {
         positions: &episode(&t.positions, s.bodies * s.dims),
         velocities: &episode(&t.velocities, s.bodies * s.dims),
-        extras: &episode(&t.extras, s.agents * s.extras),
+        agent_state: &episode(&t.agent_state, s.agents * s.agent_state),
         landmarks: &t.landmarks[b * s.landmarks * s.dims..(b + 1) * s.landmarks * s.dims],
-        goals: &t.goals[b * s.agents * s.targets..(b + 1) * s.agents * s.targets],
+        goals: &t.goals[b * s.agents * s.goals_per_agent..(b + 1) * s.agents * s.goals_per_agent],
     })
 }

@@ -1,8 +1,8 @@
 use super::*;
 use crate::fixtures;
-use crate::ingest::Limits;
-use crate::service::RunIdentity;
-use crate::weights::Weights;
+use crate::run_identity::RunIdentity;
+use crate::serve::validate::Limits;
+use crate::serve::weights_board::Weights;
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use tokio_stream::wrappers::ReceiverStream;

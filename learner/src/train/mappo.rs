@@ -4,10 +4,10 @@
 //! Every sum has a fixed order: a minibatch is cut into a fixed number of shards whose gradients are added in order,
 //! however many threads compute them. The number of threads does not reach a number.
 
-use crate::adam::Adam;
-use crate::batch::Batch;
-use crate::gae::{Gae, ValueNorm};
-use crate::loss::{PolicyRows, PolicyStats, ValueRows, policy_loss, value_loss};
+use crate::train::adam::Adam;
+use crate::train::batch::Batch;
+use crate::train::gae::{Gae, ValueNorm};
+use crate::train::loss::{PolicyRows, PolicyStats, ValueRows, policy_loss, value_loss};
 use candle_core::{Result, Tensor, Var};
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::rng::{Key, Purpose};
@@ -94,7 +94,7 @@ impl Mappo {
             spec: executor::feature_spec(&config.executor, &config.task),
             heads,
             agents: config.task.agents,
-            chunk: if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk },
+            chunk: if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk_length },
             config: config.clone(),
         })
     }
@@ -154,7 +154,7 @@ impl Mappo {
         let rows = episodes * steps * n;
         let (mut advantages, mut returns) = (vec![0.0; rows], vec![0.0; rows]);
         let mut old_values = Vec::with_capacity(rows);
-        let gae = Gae { gamma: m.gamma, lambda: m.gae_lambda, bootstrap: m.bootstrap };
+        let gae = Gae { gamma: m.gamma, lambda: m.gae_lambda, bootstrap: m.bootstrap_at_horizon };
         for (episode, evaluation) in evaluations.iter().enumerate() {
             let raw: Vec<f32> = evaluation.values.iter().map(|v| v * deviation + mean).collect();
             let (from, to) = (episode * steps * n, (episode + 1) * steps * n);
@@ -174,7 +174,7 @@ impl Mappo {
         // 3. Epochs over shuffled minibatches of chunks.
         let units: Vec<(usize, usize)> =
             (0..episodes).flat_map(|e| (0..steps / self.chunk).map(move |c| (e, c * self.chunk))).collect();
-        let per_minibatch = (m.minibatch / (self.chunk * n)).clamp(1, units.len());
+        let per_minibatch = (m.minibatch_size / (self.chunk * n)).clamp(1, units.len());
         let minibatches = units.len().div_ceil(per_minibatch);
         let decay = if m.linear_decay { 1.0 - progress } else { 1.0 };
         let mut stats = UpdateStats::default();
@@ -191,7 +191,7 @@ impl Mappo {
                 let (mean, deviation) = state.value_norm.moments();
 
                 // 5. Gradients of both networks, shard by shard.
-                let shards = m.grad_shards.min(units.len());
+                let shards = m.gradient_slices.min(units.len());
                 let jobs: Vec<(Role, usize)> = [Role::Actor, Role::Critic]
                     .into_iter()
                     .flat_map(|role| (0..shards).map(move |s| (role, s)))
@@ -323,15 +323,21 @@ impl Mappo {
     ) -> std::result::Result<(Vec<f32>, PolicyStats, f64), ParamError> {
         let batch = data.batch;
         let rows = PolicyRows {
-            actions: batch.rows(&batch.actions, batch.shape.heads, data.units, self.chunk),
+            actions: batch.rows(&batch.actions, batch.shape.action_components, data.units, self.chunk),
             old_log_probs: batch.rows(&batch.log_probs, 1, data.units, self.chunk),
             advantages: batch.rows(advantages, 1, data.units, self.chunk),
         };
         let noise = GraphNoise::Keyed(Arc::new(batch.noise_keys(data.units, self.chunk)));
         let mut stats = PolicyStats::default();
         let gradient = self.gradient(Role::Actor, &state.actor, data, noise, |logits| {
-            let (loss, s) =
-                policy_loss(logits, rows, &self.heads, self.config.mappo.clip, self.config.mappo.entropy, data.scale)?;
+            let (loss, s) = policy_loss(
+                logits,
+                rows,
+                &self.heads,
+                self.config.mappo.clip_epsilon,
+                self.config.mappo.entropy_coef,
+                data.scale,
+            )?;
             stats = s;
             Ok(loss)
         })?;
@@ -355,7 +361,7 @@ impl Mappo {
         let mut total = 0.0;
         let m = &self.config.mappo;
         let gradient = self.gradient(Role::Critic, &state.critic, data, GraphNoise::Off, |values| {
-            let (loss, sum) = value_loss(values, rows, m.clip, m.huber_delta, data.scale)?;
+            let (loss, sum) = value_loss(values, rows, m.clip_epsilon, m.huber_delta, data.scale)?;
             total = sum;
             Ok(loss)
         })?;

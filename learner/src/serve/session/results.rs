@@ -1,16 +1,16 @@
 //! What becomes of a lease: its result is taken in, or it comes back without one.
 
 use super::{End, Handed, Session};
-use crate::gauges::steps_of;
-use crate::ingest::{admit, describe};
-use crate::ledger::{Failure, LeaseId, Ledger, MAX_FAILURES, Verdict};
-use crate::state::lock;
+use crate::serve::ledger::{Failure, LeaseId, Ledger, MAX_FAILURES, Verdict};
+use crate::serve::metrics::steps_of;
+use crate::serve::validate::{admit, describe};
 use bytes::Bytes;
 use magex_core::ids::ShardKind;
 use magex_core::trajectory::ShardResult;
 use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use magex_proto::v1::rollout_response::Message as Response;
+use magex_runtime::sync::lock;
 use magex_runtime::{status, trace};
 use std::time::{Duration, Instant};
 use tonic::Status;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 use tonic::Status;
 
-use crate::state::lock;
+use magex_runtime::sync::lock;
 
 /// Versions that are kept: with a policy lag of 1 shards name the version before the latest.
 const KEPT: usize = 2;

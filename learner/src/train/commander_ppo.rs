@@ -8,7 +8,7 @@ mod imitation;
 #[cfg(test)]
 mod tests;
 
-use crate::adam::Adam;
+use crate::train::adam::Adam;
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::CommanderConfig;
 use magex_core::keys::random_goals;
@@ -96,7 +96,7 @@ impl CommanderPpo {
         for t in trajectories {
             let stages = self.stages.len();
             for b in 0..t.shape.episodes {
-                if random_goals(self.seed, &t.shard, b as u32, self.config.random_share).is_some() {
+                if random_goals(self.seed, &t.shard, b as u32, self.config.random_assignment_fraction).is_some() {
                     // The scheduler had no say in this episode.
                     continue;
                 }
@@ -247,7 +247,7 @@ fn start_of(t: &Trajectory, group: Group, episode: usize) -> &[f32] {
 
 /// The k-th stage's assignment of an episode, `[N]`, out of the agents' chains of goals; `None` if it is not one-to-one.
 fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Vec<u32>> {
-    let (n, stages) = (t.shape.agents, t.shape.targets);
+    let (n, stages) = (t.shape.agents, t.shape.goals_per_agent);
     let mut goals = vec![u32::MAX; n];
     for (agent, chain) in t.goals[episode * n * stages..(episode + 1) * n * stages].chunks_exact(stages).enumerate() {
         let from = if k == 0 { agent } else { chain[k - 1] as usize };

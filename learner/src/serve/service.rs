@@ -1,11 +1,12 @@
 //! The learner's gRPC face, and how it is served.
 
-use crate::collector::{GrpcCollector, StopReason};
-use crate::ingest::Limits;
-use crate::session;
-use crate::state::Shared;
-use crate::weights;
-use magex_core::ids::RunId;
+use crate::run_events::StopReason;
+use crate::run_identity::RunIdentity;
+use crate::serve::grpc_collector::GrpcCollector;
+use crate::serve::session;
+use crate::serve::shared::Shared;
+use crate::serve::validate::Limits;
+use crate::serve::weights_board;
 use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer};
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_MESSAGE_BYTES, v1};
 use magex_runtime::access::{Role, caller};
@@ -33,23 +34,6 @@ const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
 /// What one caller, and everybody, may have in flight. All actors of a run may be one caller.
 const FLIGHTS: FlightLimits = FlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
-
-/// What every peer is told about the run.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RunIdentity {
-    /// Identity of the run.
-    pub run_id: RunId,
-    /// Name of the run, for people.
-    pub name: String,
-    /// Fingerprint of the run's task.
-    pub task_fingerprint: String,
-    /// The run's configuration, TOML.
-    pub run_config_toml: String,
-    /// Seed of the run.
-    pub seed: u64,
-    /// An actor that says nothing for so long loses its leases.
-    pub lease: Duration,
-}
 
 /// The learner's two ends: one for the network, one for the training thread.
 pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, GrpcCollector) {
@@ -213,7 +197,7 @@ impl LearnerService for LearnerApi {
                     shared.gauges.weights_published.observe(since.elapsed());
                 }
             };
-            closing.run_until_cancelled(weights::stream(board, toml, reader, patience, sent)).await;
+            closing.run_until_cancelled(weights_board::stream(board, toml, reader, patience, sent)).await;
             drop(place);
         });
         Ok(Response::new(ReceiverStream::new(stream)))

@@ -32,10 +32,10 @@ impl Limits {
         let s = &self.shape;
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
-        let extras = (t + 1) * b * n * s.extras;
-        let floats = 2 * state + extras + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b * s.targets;
-        let goals = b * n * s.targets;
-        4 * (floats + goals) + t * b * n * s.heads + 96 * b + 64 * 1024
+        let agent_state = (t + 1) * b * n * s.agent_state;
+        let floats = 2 * state + agent_state + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b * s.goals_per_agent;
+        let goals = b * n * s.goals_per_agent;
+        4 * (floats + goals) + t * b * n * s.action_components + 96 * b + 64 * 1024
     }
 }
 
@@ -83,7 +83,7 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
 /// Every agent has goals of its own, in every stage.
 fn check_one_to_one(trajectory: &Trajectory) -> Result<(), ConvertError> {
     let shape = &trajectory.shape;
-    let (n, k) = (shape.agents.max(1), shape.targets.max(1));
+    let (n, k) = (shape.agents.max(1), shape.goals_per_agent.max(1));
     for (episode, goals) in trajectory.goals.chunks(n * k).enumerate() {
         let mut taken = vec![false; n * k];
         for (place, &goal) in goals.iter().enumerate() {
@@ -114,9 +114,11 @@ fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError
 
 fn check_recording(limits: &Limits, recording: &Recording) -> Result<(), ConvertError> {
     check_shape("eval.recording.shape", &recording.shape, limits, 1)?;
-    for (name, values) in
-        [("positions", &recording.positions), ("extras", &recording.extras), ("landmarks", &recording.landmarks)]
-    {
+    for (name, values) in [
+        ("positions", &recording.positions),
+        ("agent_state", &recording.agent_state),
+        ("landmarks", &recording.landmarks),
+    ] {
         if let Some(place) = values.iter().position(|value| !value.is_finite()) {
             let problem = format!("{} is not finite", values[place]);
             return Err(ConvertError::new(format!("eval.recording.{name}[{place}]"), problem));

@@ -1,21 +1,22 @@
 //! What the training thread and the connections share.
 
-use crate::collector::{CollectError, IterationReport, RunEvent, StopReason};
-use crate::events::Events;
-use crate::gauges::LearnerGauges;
-use crate::ingest::Limits;
-use crate::ledger::{Counters, GivenUp, Ledger, PlanError, SessionId};
-use crate::service::RunIdentity;
-use crate::tally::Tally;
-use crate::weights::{Board, Weights};
+use crate::report::shard_timing::Tally;
+use crate::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use crate::run_identity::RunIdentity;
+use crate::serve::events::Events;
+use crate::serve::ledger::{Counters, GivenUp, Ledger, PlanError, SessionId};
+use crate::serve::metrics::LearnerGauges;
+use crate::serve::validate::Limits;
+use crate::serve::weights_board::{Board, Weights};
 use magex_core::ids::{Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1;
 use magex_runtime::metrics::Metrics;
 use magex_runtime::status;
+use magex_runtime::sync::lock;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc::WeakSender;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
@@ -29,11 +30,6 @@ const MISSED: Duration = Duration::from_secs(600);
 const MOST_MISSED: usize = 1024;
 /// Processes that are remembered as sent away.
 const SENT_AWAY: usize = 1024;
-
-/// A panic of another thread leaves our plain data usable.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 /// An actor as its connection sees it.
 #[derive(Debug, Clone)]

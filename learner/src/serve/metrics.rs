@@ -1,8 +1,8 @@
 //! The learner's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
 
-use crate::bound::BoundBy;
-use crate::ledger;
-use crate::metrics::IterationMetrics;
+use crate::report::bottleneck::BoundBy;
+use crate::report::metrics_file::IterationMetrics;
+use crate::serve::ledger;
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
 use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Held, Metrics, Seconds, SecondsBy};

@@ -1,11 +1,11 @@
 //! What a run writes down: one line per iteration in metrics.jsonl, and summary.json at its end. docs/metrics.md lists
 //! every field.
 
-use crate::bound::{Bound, Collected, judge};
 use crate::checkpoint::Progress;
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::commander::CommanderStats;
-use crate::mappo::UpdateStats;
+use crate::report::bottleneck::{Bound, Collected, judge};
+use crate::train::commander_ppo::CommanderStats;
+use crate::train::mappo::UpdateStats;
 use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::EpisodeMetrics;

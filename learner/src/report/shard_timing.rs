@@ -1,6 +1,6 @@
 //! Where the time of the open plan goes, by the learner's clock and by what the actors say of theirs.
 
-use crate::bound::Collected;
+use crate::report::bottleneck::Collected;
 use magex_proto::v1::ShardTiming;
 use std::time::{Duration, Instant};
 

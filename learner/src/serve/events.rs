@@ -1,8 +1,8 @@
 //! What happened in the run so far, for whoever watches, however late.
 
-use crate::collector::RunEvent;
-use crate::state::lock;
+use crate::run_events::RunEvent;
 use magex_proto::v1;
+use magex_runtime::sync::lock;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;

@@ -1,0 +1,6 @@
+//! What a run writes for people and for tools.
+
+pub mod bottleneck;
+pub mod metrics_file;
+pub(crate) mod shard_timing;
+pub mod tensorboard;
