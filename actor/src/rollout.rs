@@ -4,6 +4,7 @@
 use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, Shard, ShardKind};
 use magex_core::keys::episode_keys;
+use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
 use magex_core::rng::{Key, Purpose, Stream, sequence};
 use magex_core::task::{ActionCode, Group, Stage};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
@@ -291,16 +292,12 @@ fn to_world(code: ActionCode, heads: usize, symmetries: &[Symmetry], actions: &m
 fn metrics(worlds: &dyn Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
     let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
     let episodes = worlds.scores().into_iter().zip(ratios.chunks_exact(stages.max(1)));
-    let metrics = episodes.map(|(score, ratios)| EpisodeMetrics {
-        success: score.success,
-        matched_success: score.matched_success,
-        spawn_success: score.spawn_success,
-        arrival_step: score.arrival_step,
-        collisions_per_agent_step: score.collisions_per_agent_step,
-        collision_rate: score.collision_rate,
-        reward: score.reward,
-        cost_ratio: ratios.first().copied().unwrap_or(1.0),
-        second_cost_ratio: ratios.get(1).copied(),
+    let metrics = episodes.map(|(mut episode, ratios)| {
+        episode[COST_RATIO] = ratios.first().copied().unwrap_or(1.0);
+        if let Some(ratio) = ratios.get(1) {
+            episode[SECOND_COST_RATIO] = *ratio;
+        }
+        episode
     });
     metrics.collect()
 }

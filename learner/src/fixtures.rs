@@ -1,6 +1,7 @@
 //! Synthetic shards and results for tests.
 
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::{METRICS, REWARD, SECOND_COST_RATIO, SUCCESS_RATE};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, Trajectory};
 
@@ -26,18 +27,10 @@ fn shape(task: &TaskConfig, episodes: usize) -> Shape {
     task.shape(episodes)
 }
 
+/// 1 is a value that every metric may have.
 fn metrics(episodes: usize) -> Vec<EpisodeMetrics> {
-    let one = EpisodeMetrics {
-        success: 0.5,
-        matched_success: 0.5,
-        spawn_success: 0.1,
-        collision_rate: 0.0,
-        second_cost_ratio: None,
-        arrival_step: 2,
-        collisions_per_agent_step: 0.1,
-        reward: -0.2,
-        cost_ratio: 1.1,
-    };
+    let mut one = EpisodeMetrics([1.0; METRICS.len()]);
+    (one[SUCCESS_RATE], one[REWARD], one[SECOND_COST_RATIO]) = (0.5, -0.2, f32::NAN);
     vec![one; episodes]
 }
 

@@ -14,6 +14,7 @@ use crate::train::commander_ppo::CommanderPpo;
 use crate::train::mappo::Mappo;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
 use magex_nets::commander::CommanderError;
 use magex_nets::params::ParamError;
@@ -259,7 +260,7 @@ impl Trainer {
             let evaluation = summarise(outcomes.iter().flat_map(|o| &o.metrics));
             // Counted when the iteration is complete: whoever resumes before that evaluates again.
             let on_target = match &evaluation {
-                Some(evaluation) if evaluation.success_rate >= f64::from(self.config.run.target_success) => {
+                Some(evaluation) if evaluation.means[SUCCESS_RATE] >= Some(self.config.run.target_success.into()) => {
                     self.progress.on_target.saturating_add(1)
                 }
                 Some(_) => 0,
@@ -377,8 +378,8 @@ impl Trainer {
         collector.event(RunEvent::Iteration(IterationReport {
             iteration: Iteration(metrics.iteration),
             joint_env_steps: metrics.joint_env_steps,
-            success: metrics.success_rate.map(|x| x as f32),
-            reward: metrics.reward.map(|x| x as f32),
+            success: metrics.episodes.get(SUCCESS_RATE).map(|x| x as f32),
+            reward: metrics.episodes.get(REWARD).map(|x| x as f32),
             metrics_json: line,
         }));
         Ok(())

@@ -3,6 +3,7 @@
 use crate::{arrays, v1};
 use bytes::Bytes;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::METRICS;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use prost::Message as _;
 
@@ -132,36 +133,14 @@ impl From<&v1::Shape> for Shape {
     }
 }
 
-impl From<&EpisodeMetrics> for v1::EpisodeMetrics {
-    fn from(metrics: &EpisodeMetrics) -> Self {
-        Self {
-            success: metrics.success,
-            matched_success: metrics.matched_success,
-            arrival_step: metrics.arrival_step,
-            collisions_per_agent_step: metrics.collisions_per_agent_step,
-            reward: metrics.reward,
-            cost_ratio: metrics.cost_ratio,
-            second_cost_ratio: metrics.second_cost_ratio,
-            spawn_success: metrics.spawn_success,
-            collision_rate: metrics.collision_rate,
-        }
-    }
+fn from_metrics(episodes: &[EpisodeMetrics]) -> v1::Array {
+    let values: Vec<f32> = episodes.iter().flat_map(|episode| episode.0).collect();
+    arrays::from_f32(&[episodes.len(), METRICS.len()], &values)
 }
 
-impl From<&v1::EpisodeMetrics> for EpisodeMetrics {
-    fn from(metrics: &v1::EpisodeMetrics) -> Self {
-        Self {
-            success: metrics.success,
-            matched_success: metrics.matched_success,
-            arrival_step: metrics.arrival_step,
-            collisions_per_agent_step: metrics.collisions_per_agent_step,
-            reward: metrics.reward,
-            cost_ratio: metrics.cost_ratio,
-            second_cost_ratio: metrics.second_cost_ratio,
-            spawn_success: metrics.spawn_success,
-            collision_rate: metrics.collision_rate,
-        }
-    }
+fn to_metrics(message: Option<v1::Array>, episodes: usize) -> Result<Vec<EpisodeMetrics>, ConvertError> {
+    let values = arrays::to_f32("metrics", message, &[episodes, METRICS.len()])?;
+    Ok(values.as_chunks().0.iter().map(|episode| EpisodeMetrics(*episode)).collect())
 }
 
 impl From<&Trajectory> for v1::Trajectory {
@@ -182,7 +161,7 @@ impl From<&Trajectory> for v1::Trajectory {
             goal_log_probs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.goal_log_probs)),
             costs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.costs)),
             exact_costs: Some(arrays::from_f32(&[b, s.goals_per_agent], &trajectory.exact_costs)),
-            metrics: trajectory.metrics.iter().map(Into::into).collect(),
+            metrics: Some(from_metrics(&trajectory.metrics)),
         }
     }
 }
@@ -206,7 +185,7 @@ fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, Conve
         goal_log_probs: arrays::to_f32("goal_log_probs", message.goal_log_probs, &[b, s.goals_per_agent])?,
         costs: arrays::to_f32("costs", message.costs, &[b, s.goals_per_agent])?,
         exact_costs: arrays::to_f32("exact_costs", message.exact_costs, &[b, s.goals_per_agent])?,
-        metrics: message.metrics.iter().map(Into::into).collect(),
+        metrics: to_metrics(message.metrics, b)?,
     })
 }
 
@@ -254,7 +233,7 @@ pub fn encode_result(run_id: &RunId, weights_sha256: &str, result: &ShardResult)
     let body = match result {
         ShardResult::Train(trajectory) => v1::shard_result::Result::Trajectory(trajectory.into()),
         ShardResult::Eval(outcome) => v1::shard_result::Result::Eval(v1::EvalOutcome {
-            metrics: outcome.metrics.iter().map(Into::into).collect(),
+            metrics: Some(from_metrics(&outcome.metrics)),
             recording: outcome.recording.as_ref().map(Into::into),
         }),
     };
@@ -277,7 +256,7 @@ pub fn decode_result(bytes: Bytes) -> Result<Delivery, ConvertError> {
         }
         Some(v1::shard_result::Result::Eval(body)) => ShardResult::Eval(EvalOutcome {
             shard,
-            metrics: body.metrics.iter().map(Into::into).collect(),
+            metrics: to_metrics(body.metrics, shard.episodes as usize).map_err(|error| error.within("eval"))?,
             recording: body.recording.map(Recording::try_from).transpose().map_err(|e| e.within("eval.recording"))?,
         }),
         None => return Err(ConvertError::missing("result")),

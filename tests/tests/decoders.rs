@@ -4,6 +4,7 @@
 use magex_commander::service::CommanderConfig;
 use magex_commander::trained::load_scheduler;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::METRICS;
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_proto::convert::encode_result;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
@@ -123,17 +124,8 @@ fn trajectory(run: &Run) -> ShardResult {
     };
     let shape = task.shape(2);
     let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
-    let metrics = EpisodeMetrics {
-        success: 1.0,
-        matched_success: 1.0,
-        spawn_success: 0.0,
-        collision_rate: 0.0,
-        second_cost_ratio: None,
-        arrival_step: 1,
-        collisions_per_agent_step: 0.0,
-        reward: 0.5,
-        cost_ratio: 1.0,
-    };
+    // A value that every metric may have.
+    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
     ShardResult::Train(Trajectory {
         shard,
         shape,

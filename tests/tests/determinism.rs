@@ -5,6 +5,7 @@
 use magex::local::LocalCollector;
 use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
 use magex_core::ids::{RunId, Shard};
+use magex_core::metrics_table::{COST_RATIO, SUCCESS_RATE};
 use magex_core::task::TaskName;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint;
@@ -60,7 +61,8 @@ fn random_goals_reach_the_share_of_the_training_episodes_and_no_evaluation() {
     assert_ne!(hash(&config, 1, 1), hash(&assigned, 1, 1));
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
     let Outcome::Finished(summary) = &ran.outcome else { panic!("not finished") };
-    assert!(summary.cost_ratio < 1.2, "evaluations are not given random goals: {}", summary.cost_ratio);
+    let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
+    assert!(ratio < 1.2, "evaluations are not given random goals: {ratio}");
     let trained: Vec<f64> = updates(&ran.events).iter().filter_map(|l| l["sampled_cost_ratio"].as_f64()).collect();
     assert!(trained.iter().any(|&ratio| ratio > 1.1), "half of the training episodes are: {trained:?}");
 }
@@ -155,9 +157,10 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
             .clone();
         let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
         let Outcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
-        assert!(summary.cost_ratio >= 0.999, "{kind}: better than exact");
+        let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
+        assert!(ratio >= 0.999, "{kind}: better than exact");
         if kind == CommanderKind::Exact {
-            assert!((summary.cost_ratio - 1.0).abs() < 1e-6);
+            assert!((ratio - 1.0).abs() < 1e-6);
         }
         assert_eq!(before.params.numbers.is_empty(), !kind.learned(), "{kind}");
     }
@@ -171,7 +174,7 @@ fn it_learns() {
     let config = RunConfig::from_toml(text).unwrap();
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 2, 2);
     let Outcome::Finished(summary) = ran.outcome else { panic!("not finished") };
-    assert!(summary.success_rate > 0.9, "{summary:?}");
+    assert!(summary.episodes.greedy[SUCCESS_RATE].unwrap() > 0.9, "{summary:?}");
 }
 
 /// Where a run is interrupted.
@@ -208,7 +211,7 @@ impl Collector for Interrupted {
                 && outcome.shard.eval_set == EVAL_SET_TRAINING
             {
                 let success = if self.reached.contains(&outcome.shard.iteration.0) { 1.0 } else { 0.0 };
-                outcome.metrics.iter_mut().for_each(|episode| episode.success = success);
+                outcome.metrics.iter_mut().for_each(|episode| episode[SUCCESS_RATE] = success);
             }
         }
         Ok(results)

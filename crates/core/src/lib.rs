@@ -6,6 +6,7 @@
 pub mod config;
 pub mod ids;
 pub mod keys;
+pub mod metrics_table;
 pub mod rng;
 pub mod task;
 pub mod trajectory;

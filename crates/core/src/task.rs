@@ -8,6 +8,7 @@ mod observation;
 mod push_ball;
 mod spawn;
 
+use crate::metrics_table::METRICS;
 use crate::trajectory::Shape;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -353,7 +354,9 @@ impl TaskConfig {
 
     /// SHA-256 of everything that decides what an episode is: both sides of a connection must agree on it.
     pub fn fingerprint(&self) -> String {
-        let text = serde_json::to_string(&(TASK_SEMANTICS, self)).unwrap_or_default();
+        // An episode's metrics travel as numbers in the order of this process's table.
+        let metrics: Vec<&str> = METRICS.iter().map(|metric| metric.name).collect();
+        let text = serde_json::to_string(&(TASK_SEMANTICS, metrics, self)).unwrap_or_default();
         Sha256::digest(text.as_bytes()).iter().map(|byte| format!("{byte:02x}")).collect()
     }
 }

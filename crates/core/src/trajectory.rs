@@ -1,7 +1,9 @@
 //! What comes back from a shard: a trajectory to train on, or the metrics of evaluation episodes.
 
 use crate::ids::Shard;
+use crate::metrics_table::METRICS;
 use serde::{Deserialize, Serialize};
+use std::ops::{Index, IndexMut};
 
 /// Sizes of a shard's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -60,28 +62,42 @@ pub struct Trajectory {
     pub metrics: Vec<EpisodeMetrics>,
 }
 
-/// What one episode scored.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct EpisodeMetrics {
-    /// Share of landmarks that are covered at the last step: by any agent within 0.15, by any ball within 0.30 (Push Ball),
-    /// by any drone within 0.15 that has not crashed.
-    pub success: f32,
-    /// Share of landmarks that can be matched one-to-one to what covers them; Push Ball: that are covered by their own ball.
-    pub matched_success: f32,
-    /// Share of landmarks that were covered before the first step.
-    pub spawn_success: f32,
-    /// First step after which at least 99 % of the landmarks were covered; the horizon + 1 if it never happened.
-    pub arrival_step: u32,
-    /// Other agents closer than two radii, per agent and step.
-    pub collisions_per_agent_step: f32,
-    /// Share of the agents that crashed; 0 in tasks where nothing crashes.
-    pub collision_rate: f32,
-    /// Mean reward per agent and step.
-    pub reward: f32,
-    /// C_c / C_h at the start of the episode: agents to their (first) goals.
-    pub cost_ratio: f32,
-    /// The same of the second stage (balls to landmarks), if the task has one.
-    pub second_cost_ratio: Option<f32>,
+/// What one episode scored: a value for each row of [`METRICS`], NaN for a metric that the task does not have.
+#[derive(Debug, Clone, Copy)]
+pub struct EpisodeMetrics(pub [f32; METRICS.len()]);
+
+impl EpisodeMetrics {
+    /// The given rows; the others are absent.
+    pub fn of<const K: usize>(values: [(usize, f32); K]) -> Self {
+        let mut all = [f32::NAN; METRICS.len()];
+        values.into_iter().for_each(|(metric, value)| all[metric] = value);
+        Self(all)
+    }
+
+    /// The value of a row, if the task has it.
+    pub fn get(&self, metric: usize) -> Option<f32> {
+        Some(self.0[metric]).filter(|value| !value.is_nan())
+    }
+}
+
+impl Index<usize> for EpisodeMetrics {
+    type Output = f32;
+    fn index(&self, metric: usize) -> &f32 {
+        &self.0[metric]
+    }
+}
+
+impl IndexMut<usize> for EpisodeMetrics {
+    fn index_mut(&mut self, metric: usize) -> &mut f32 {
+        &mut self.0[metric]
+    }
+}
+
+/// Equal bits, so that an absent metric equals itself.
+impl PartialEq for EpisodeMetrics {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.map(f32::to_bits) == other.0.map(f32::to_bits)
+    }
 }
 
 /// The states of one episode, to be looked at.

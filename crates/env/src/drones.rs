@@ -19,12 +19,13 @@ mod script;
 
 pub use script::scripted_drones;
 
-use crate::env::{Env, Score};
+use crate::env::Env;
 use crate::error::{EnvError, check_finite, check_len};
 use crate::spawn::uniform;
 use episode::Episode;
 use magex_core::rng::Stream;
 use magex_core::task::{DroneConfig, TaskConfig, TaskName};
+use magex_core::trajectory::EpisodeMetrics;
 use model::{Craft, Effects};
 use world::Laws;
 
@@ -233,7 +234,7 @@ impl Env for Drones {
         Ok(())
     }
 
-    fn scores(&self) -> Vec<Score> {
+    fn scores(&self) -> Vec<EpisodeMetrics> {
         let worlds = self.episodes.iter().zip(self.landmarks.chunks_exact(3 * self.agents));
         worlds.map(|(episode, landmarks)| episode.score(self.steps, self.horizon, landmarks)).collect()
     }

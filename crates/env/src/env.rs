@@ -6,6 +6,7 @@ use crate::push_ball::PushBall;
 use crate::spread::Spread;
 use magex_core::rng::Stream;
 use magex_core::task::{TaskConfig, TaskName};
+use magex_core::trajectory::EpisodeMetrics;
 
 /// B episodes of a task, stepped together. Arrays are row-major, lengths in world units, times in seconds; sizes are those
 /// of [`TaskConfig::shape`].
@@ -37,27 +38,13 @@ pub trait Env: Send {
     /// with the reward of the state after the step.
     fn step(&mut self, actions: &[u8], rewards: &mut [f32]) -> Result<(), EnvError>;
 
-    /// `[B]` what each episode scored up to now; after T steps, its final score.
-    fn scores(&self) -> Vec<Score>;
+    /// `[B]` what each episode scored up to now; after T steps, its final score. The metrics of the assignment are absent.
+    fn scores(&self) -> Vec<EpisodeMetrics>;
 }
 
-/// What an episode scored, as far as the environment knows.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Score {
-    /// Share of landmarks that are covered.
-    pub success: f32,
-    /// Share of landmarks that can be matched one-to-one to what covers them; Push Ball: covered by their own ball.
-    pub matched_success: f32,
-    /// Share of landmarks that were covered before the first step.
-    pub spawn_success: f32,
-    /// First step after which at least 99 % of the landmarks were covered; T + 1 if it never happened.
-    pub arrival_step: u32,
-    /// Other agents in contact, per agent and step.
-    pub collisions_per_agent_step: f32,
-    /// Share of the agents that crashed; 0 in tasks where nothing crashes.
-    pub collision_rate: f32,
-    /// Mean reward per agent and step.
-    pub reward: f32,
+/// The value of [`ALL_COVERED_RATE`](magex_core::metrics_table::ALL_COVERED_RATE) for an episode of this success.
+pub(crate) fn all_covered(success: f32) -> f32 {
+    if success >= 1.0 { 1.0 } else { 0.0 }
 }
 
 /// Episodes of a task, one per stream. In training, starts that help learning may be mixed in.

@@ -27,7 +27,7 @@ mod spread;
 mod swarm;
 
 pub use drones::{Drones, scripted_drones};
-pub use env::{Env, Score, View, new_env};
+pub use env::{Env, View, new_env};
 pub use error::EnvError;
 pub use push_ball::PushBall;
 pub use real::Real;

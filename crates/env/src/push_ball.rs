@@ -5,12 +5,17 @@ pub(crate) mod law;
 pub mod layouts;
 mod start;
 
-use crate::env::{Env, Score};
+use crate::env::{Env, all_covered};
 use crate::error::{EnvError, check_actions, check_finite, check_len};
 use crate::spread::LANES;
 use batch::Batch;
+use magex_core::metrics_table::{
+    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
+    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::rng::Stream;
 use magex_core::task::TaskConfig;
+use magex_core::trajectory::EpisodeMetrics;
 
 pub use start::{Start, spawn};
 
@@ -143,20 +148,22 @@ impl PushBall {
         (count as f64 / self.agents as f64) as f32
     }
 
-    fn score(&self, world: usize) -> Score {
+    fn score(&self, world: usize) -> EpisodeMetrics {
         let ((reward, hits), arrival) = either!(&self.worlds, batch => (batch.sums(world), batch.arrival(world)));
         let own = 2 * world * self.agents..2 * (world + 1) * self.agents;
         let goals = self.goals.get(own).unwrap_or_default();
         let agent_steps = f64::from(self.steps.max(1)) * self.agents as f64;
-        Score {
-            success: self.share(self.covered(world)),
-            matched_success: self.share(either!(&self.worlds, batch => batch.matched(world, goals))),
-            spawn_success: self.spawn_success[world],
-            arrival_step: arrival.unwrap_or(self.horizon + 1),
-            collisions_per_agent_step: (hits / agent_steps) as f32,
-            collision_rate: 0.0,
-            reward: (reward / agent_steps) as f32,
-        }
+        let success = self.share(self.covered(world));
+        EpisodeMetrics::of([
+            (SUCCESS_RATE, success),
+            (MATCHED_SUCCESS_RATE, self.share(either!(&self.worlds, batch => batch.matched(world, goals)))),
+            (ALL_COVERED_RATE, all_covered(success)),
+            (SPAWN_SUCCESS_RATE, self.spawn_success[world]),
+            (ARRIVAL_STEP, arrival.unwrap_or(self.horizon + 1) as f32),
+            (COLLISIONS_PER_AGENT_STEP, (hits / agent_steps) as f32),
+            (COLLISION_RATE, 0.0),
+            (REWARD, (reward / agent_steps) as f32),
+        ])
     }
 
     /// B · N.
@@ -224,7 +231,7 @@ impl Env for PushBall {
         Ok(())
     }
 
-    fn scores(&self) -> Vec<Score> {
+    fn scores(&self) -> Vec<EpisodeMetrics> {
         (0..self.episodes()).map(|world| self.score(world)).collect()
     }
 }

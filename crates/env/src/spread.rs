@@ -1,12 +1,17 @@
 //! Simple Spread as the rest of MAGE-X sees it.
 
 use crate::batch::Batch;
-use crate::env::{Env, Score};
+use crate::env::{Env, all_covered};
 use crate::error::{EnvError, check_actions, check_finite, check_len};
 use crate::matching::maximum_matching;
 use crate::spawn;
+use magex_core::metrics_table::{
+    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
+    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::rng::Stream;
 use magex_core::task::TaskConfig;
+use magex_core::trajectory::EpisodeMetrics;
 
 /// A landmark is covered when an agent's centre is within this distance (agent radius 0.1 + landmark radius 0.05).
 pub const COVER_RADIUS: f64 = 0.15;
@@ -124,22 +129,24 @@ impl Spread {
         out
     }
 
-    fn score(&self, world: usize) -> Score {
+    fn score(&self, world: usize) -> EpisodeMetrics {
         let (near, arrival, (reward, hits)) = match &self.worlds {
             Worlds::Lanes(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
             Worlds::Cells(batch) => (batch.near(world), batch.arrival(world), batch.sums(world)),
         };
         let share = |count: usize| (count as f64 / self.agents as f64) as f32;
         let agent_steps = f64::from(self.steps.max(1)) * self.agents as f64;
-        Score {
-            success: covered(&near, self.agents),
-            matched_success: share(maximum_matching(&near, self.agents)),
-            spawn_success: self.spawn_success[world],
-            arrival_step: arrival.unwrap_or(self.horizon + 1),
-            collisions_per_agent_step: (hits / agent_steps) as f32,
-            collision_rate: 0.0,
-            reward: (reward / agent_steps) as f32,
-        }
+        let success = covered(&near, self.agents);
+        EpisodeMetrics::of([
+            (SUCCESS_RATE, success),
+            (MATCHED_SUCCESS_RATE, share(maximum_matching(&near, self.agents))),
+            (ALL_COVERED_RATE, all_covered(success)),
+            (SPAWN_SUCCESS_RATE, self.spawn_success[world]),
+            (ARRIVAL_STEP, arrival.unwrap_or(self.horizon + 1) as f32),
+            (COLLISIONS_PER_AGENT_STEP, (hits / agent_steps) as f32),
+            (COLLISION_RATE, 0.0),
+            (REWARD, (reward / agent_steps) as f32),
+        ])
     }
 
     /// B · N.
@@ -221,7 +228,7 @@ impl Env for Spread {
         Ok(())
     }
 
-    fn scores(&self) -> Vec<Score> {
+    fn scores(&self) -> Vec<EpisodeMetrics> {
         (0..self.episodes()).map(|world| self.score(world)).collect()
     }
 }

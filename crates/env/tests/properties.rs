@@ -3,6 +3,7 @@
 // Helpers of tests; the lint's exception covers test functions only.
 #![allow(clippy::unwrap_used)]
 
+use magex_core::metrics_table::{ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, SUCCESS_RATE};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_env::{Env as _, Spread};
 use proptest::prelude::*;
@@ -104,10 +105,10 @@ proptest! {
         let (spread, log) = case.play();
         prop_assert!(log.iter().flatten().flatten().all(|value| value.is_finite()));
         for m in spread.scores() {
-            prop_assert!((0.0..=1.0).contains(&m.success));
-            prop_assert!(m.matched_success <= m.success);
-            prop_assert!(m.arrival_step >= 1 && m.arrival_step <= spread.horizon() + 1);
-            prop_assert!(m.collisions_per_agent_step >= 0.0 && m.collisions_per_agent_step < case.agents as f32);
+            prop_assert!((0.0..=1.0).contains(&m[SUCCESS_RATE]));
+            prop_assert!(m[MATCHED_SUCCESS_RATE] <= m[SUCCESS_RATE]);
+            prop_assert!(m[ARRIVAL_STEP] >= 1.0 && m[ARRIVAL_STEP] <= (spread.horizon() + 1) as f32);
+            prop_assert!(m[COLLISIONS_PER_AGENT_STEP] >= 0.0 && m[COLLISIONS_PER_AGENT_STEP] < case.agents as f32);
         }
     }
 

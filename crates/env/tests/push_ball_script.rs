@@ -8,12 +8,14 @@
 mod assign;
 
 use assign::exact;
+use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, SPAWN_SUCCESS_RATE, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig, TaskName};
+use magex_core::trajectory::EpisodeMetrics;
 use magex_env::scripted::scripted_push_ball;
-use magex_env::{Env as _, PushBall, Score, View};
+use magex_env::{Env as _, PushBall, View};
 
-fn play(task: &TaskConfig, episodes: u32) -> (Vec<Score>, Option<u32>) {
+fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) {
     let n = task.agents;
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
     let mut env = PushBall::new(task, streams, false).unwrap();
@@ -41,14 +43,14 @@ fn play(task: &TaskConfig, episodes: u32) -> (Vec<Score>, Option<u32>) {
         };
         scripted_push_ball(&view, n, &mut actions).unwrap();
         env.step(&actions, &mut rewards).unwrap();
-        if solved.is_none() && mean(&env.scores(), |score| score.success) >= 0.97 {
+        if solved.is_none() && mean(&env.scores(), |score| score[SUCCESS_RATE]) >= 0.97 {
             solved = Some(step);
         }
     }
     (env.scores(), solved)
 }
 
-fn mean(scores: &[Score], value: fn(&Score) -> f32) -> f32 {
+fn mean(scores: &[EpisodeMetrics], value: fn(&EpisodeMetrics) -> f32) -> f32 {
     scores.iter().map(value).sum::<f32>() / scores.len() as f32
 }
 
@@ -64,12 +66,12 @@ fn measure() {
     for (agents, spawn) in settings {
         let task = TaskConfig::of(TaskName::PushBall, agents, spawn);
         let (scores, solved) = play(&task, 100);
-        let full = scores.iter().filter(|score| score.success == 1.0).count();
+        let full = scores.iter().filter(|score| score[SUCCESS_RATE] == 1.0).count();
         let [success, own, start, hits] = [
-            |score: &Score| score.success,
-            |score: &Score| score.matched_success,
-            |score: &Score| score.spawn_success,
-            |score: &Score| score.collisions_per_agent_step,
+            |score: &EpisodeMetrics| score[SUCCESS_RATE],
+            |score: &EpisodeMetrics| score[MATCHED_SUCCESS_RATE],
+            |score: &EpisodeMetrics| score[SPAWN_SUCCESS_RATE],
+            |score: &EpisodeMetrics| score[COLLISIONS_PER_AGENT_STEP],
         ]
         .map(|value| mean(&scores, value));
         eprintln!(
@@ -81,10 +83,10 @@ fn measure() {
 fn check(agents: usize, spawn: Spawn, episodes: u32, at_least: f32) {
     let task = TaskConfig::of(TaskName::PushBall, agents, spawn);
     let (scores, _) = play(&task, episodes);
-    let success = mean(&scores, |score| score.success);
+    let success = mean(&scores, |score| score[SUCCESS_RATE]);
     assert!(success >= at_least, "{agents} {spawn}: success {success}");
     // What counts is nearly always the ball that was meant.
-    assert!(mean(&scores, |score| score.matched_success) >= at_least - 0.02, "{agents} {spawn}");
+    assert!(mean(&scores, |score| score[MATCHED_SUCCESS_RATE]) >= at_least - 0.02, "{agents} {spawn}");
 }
 
 #[test]

@@ -8,18 +8,20 @@
 mod assign;
 
 use assign::exact;
+use magex_core::metrics_table::{ARRIVAL_STEP, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
+use magex_core::trajectory::EpisodeMetrics;
+use magex_env::Env as _;
 use magex_env::Spread;
 use magex_env::scripted::scripted_actions;
-use magex_env::{Env as _, Score};
 
 fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> {
     let worlds = positions.chunks_exact(2 * agents).zip(landmarks.chunks_exact(2 * agents));
     worlds.flat_map(|(agents, landmarks)| exact(agents, landmarks)).collect()
 }
 
-fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<Score> {
+fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
     let task = TaskConfig::simple_spread(agents, spawn);
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
     let mut spread = Spread::new(&task, streams).unwrap();
@@ -40,8 +42,8 @@ fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<Score> {
 
 fn check(agents: usize, spawn: Spawn, at_least: f32, arrival_below: f32) {
     let metrics = play(agents, spawn, 400);
-    let mean = |value: fn(&Score) -> f32| metrics.iter().map(value).sum::<f32>() / metrics.len() as f32;
-    let (success, arrival) = (mean(|m| m.success), mean(|m| m.arrival_step as f32));
+    let mean = |value: fn(&EpisodeMetrics) -> f32| metrics.iter().map(value).sum::<f32>() / metrics.len() as f32;
+    let (success, arrival) = (mean(|m| m[SUCCESS_RATE]), mean(|m| m[ARRIVAL_STEP]));
     assert!(success >= at_least, "{agents} {spawn}: success {success}");
     assert!(arrival < arrival_below, "{agents} {spawn}: arrival {arrival}");
 }
@@ -68,5 +70,5 @@ fn the_lines_are_solved_layout_by_layout() {
 fn larger_sizes_are_solved() {
     check(100, Spawn::Uniform, 0.999, 60.0);
     let metrics = play(300, Spawn::Uniform, 4);
-    assert!(metrics.iter().all(|m| m.success >= 0.999), "{metrics:?}");
+    assert!(metrics.iter().all(|m| m[SUCCESS_RATE] >= 0.999), "{metrics:?}");
 }

@@ -1,8 +1,10 @@
-//! The learning curve of a run as a picture: success, arrival, collisions and assignment cost over joint steps.
+//! The learning curve of a run as a picture: the episode metrics that have a plot, over joint steps.
 
+use magex_core::metrics_table::{METRICS, Metric, Scale, Scope};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use serde::Deserialize;
+use serde_json::{Map, Value};
 use thiserror::Error;
 
 /// Why a picture could not be drawn.
@@ -25,30 +27,21 @@ pub enum CurveError {
 }
 
 /// One iteration, as far as the picture needs it. What a line does not have, or has as null, is not drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct MetricsPoint {
     /// Number of the iteration.
     pub iteration: u64,
     /// Steps of whole teams since the start of the run.
     pub joint_env_steps: u64,
-    /// Share of landmarks covered at the end, greedy evaluation.
-    #[serde(default)]
-    pub success_rate: Option<f64>,
-    /// The same in the sampled training episodes.
-    #[serde(default)]
-    pub sampled_success_rate: Option<f64>,
-    /// Other agents in contact, per agent and step.
-    #[serde(default)]
-    pub collisions_per_agent_step: Option<f64>,
-    /// Cost of the commander's assignment / cost of the exact one.
-    #[serde(default)]
-    pub cost_ratio: Option<f64>,
-    /// First step with at least 99 % of the landmarks covered.
-    #[serde(default)]
-    pub arrival_step: Option<f64>,
-    /// Mean reward per agent and step.
-    #[serde(default)]
-    pub reward: Option<f64>,
+    /// The columns of the episodes' metrics, among others.
+    #[serde(flatten)]
+    pub columns: Map<String, Value>,
+}
+
+impl MetricsPoint {
+    fn get(&self, column: &str) -> Option<f64> {
+        self.columns.get(column)?.as_f64()
+    }
 }
 
 /// Reads a metrics file. A last line without its end is left out (the run may be writing it), and an iteration that
@@ -64,8 +57,13 @@ pub fn parse_metrics(text: &str) -> Result<Vec<MetricsPoint>, CurveError> {
             .map_err(|error| CurveError::Line { line: index + 1, reason: error.to_string() })?;
         // The last line of a run only evaluates, under the number of the iteration before it.
         if let Some(last) = points.last().filter(|last| last.iteration == point.iteration) {
-            point.sampled_success_rate = point.sampled_success_rate.or(last.sampled_success_rate);
-            point.reward = point.reward.or(last.reward);
+            for column in METRICS.iter().filter_map(|metric| metric.sampled) {
+                if point.get(column).is_none()
+                    && let Some(value) = last.columns.get(column)
+                {
+                    point.columns.insert(column.to_owned(), value.clone());
+                }
+            }
         }
         while points.last().is_some_and(|last| last.iteration >= point.iteration) {
             points.pop();
@@ -77,17 +75,16 @@ pub fn parse_metrics(text: &str) -> Result<Vec<MetricsPoint>, CurveError> {
 
 const WIDTH: u32 = 960;
 const HEADER: u32 = 64;
-/// Heights of the panels; the last one also carries the labels of the shared axis.
-const PANELS: [u32; 4] = [260, 170, 170, 214];
+/// Heights of a panel, of a panel of shares, and of the labels of the shared axis below the last one.
+const HEIGHT: u32 = 170;
+const SHARES: u32 = 260;
+const AXIS: u32 = 44;
 const FONT: &str = "Inter, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif";
 const INK: RGBColor = RGBColor(27, 31, 39);
 const SOFT: RGBColor = RGBColor(102, 112, 133);
 const GRID: RGBColor = RGBColor(228, 231, 236);
 const BLUE: RGBColor = RGBColor(47, 111, 222);
 const GREEN: RGBColor = RGBColor(29, 154, 98);
-const AMBER: RGBColor = RGBColor(201, 138, 11);
-const RED: RGBColor = RGBColor(214, 64, 52);
-const VIOLET: RGBColor = RGBColor(124, 77, 190);
 
 /// One line of a panel.
 struct Series {
@@ -98,17 +95,6 @@ struct Series {
     points: Vec<(f64, f64)>,
 }
 
-/// How the vertical axis of a panel is chosen.
-#[derive(Clone, Copy)]
-enum Scale {
-    /// 0 to 1.
-    Share,
-    /// 0 to a little above the largest value.
-    FromZero,
-    /// 1 (or the smallest value, if that is less) to a little above the largest value.
-    FromOne,
-}
-
 /// The picture as SVG text. `title` is the run's name, `subtitle` its configuration in one line.
 ///
 /// # Errors
@@ -117,29 +103,21 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
     let last = points.last().ok_or(CurveError::Empty)?.joint_env_steps as f64;
     let mut svg = String::new();
     {
-        let height = HEADER + PANELS.iter().sum::<u32>();
-        let root = SVGBackend::with_string(&mut svg, (WIDTH, height)).into_drawing_area();
+        let panels: Vec<(&Metric, Scale, Vec<Series>)> = METRICS.iter().filter_map(|m| panel_of(m, points)).collect();
+        let heights = panels.iter().enumerate().map(|(index, (_, scale, _))| {
+            let axis = if index + 1 == panels.len() { AXIS } else { 0 };
+            axis + if *scale == Scale::Share { SHARES } else { HEIGHT }
+        });
+        let heights: Vec<u32> = heights.collect();
+        let root = SVGBackend::with_string(&mut svg, (WIDTH, HEADER + heights.iter().sum::<u32>())).into_drawing_area();
         root.fill(&WHITE).map_err(drawing)?;
         let (header, mut rest) = root.split_vertically(HEADER);
         header.draw_text(title, &text(26).color(&INK), (24, 14)).map_err(drawing)?;
         header.draw_text(subtitle, &text(15).color(&SOFT), (24, 42)).map_err(drawing)?;
-        let panels = [
-            ("success rate", Scale::Share, success(points)),
-            (
-                "arrival step (99 % covered)",
-                Scale::FromZero,
-                vec![line("arrival step", VIOLET, points, |p| p.arrival_step)],
-            ),
-            (
-                "contacts / agent · step",
-                Scale::FromZero,
-                vec![line("contacts", RED, points, |p| p.collisions_per_agent_step)],
-            ),
-            ("assignment cost / exact", Scale::FromOne, vec![line("cost ratio", AMBER, points, |p| p.cost_ratio)]),
-        ];
-        for (index, (name, scale, series)) in panels.iter().enumerate() {
-            let (area, below) = rest.split_vertically(PANELS[index]);
-            panel(&area, name, *scale, series, last, index + 1 == PANELS.len())?;
+        for (index, (metric, scale, series)) in panels.iter().enumerate() {
+            let (area, below) = rest.split_vertically(heights[index]);
+            let name = format!("{}, {}", metric.show.label, metric.unit);
+            panel(&area, &name, *scale, series, last, index + 1 == panels.len())?;
             rest = below;
         }
         root.present().map_err(drawing)?;
@@ -147,19 +125,21 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
     Ok(svg)
 }
 
-fn success(points: &[MetricsPoint]) -> Vec<Series> {
-    let mut greedy = line("greedy evaluation", GREEN, points, |p| p.success_rate);
-    greedy.dots = true;
-    vec![line("sampled, training episodes", BLUE, points, |p| p.sampled_success_rate), greedy]
+/// The plot of a metric, if it has one and the run has the metric.
+fn panel_of<'a>(metric: &'a Metric, points: &[MetricsPoint]) -> Option<(&'a Metric, Scale, Vec<Series>)> {
+    let scale = metric.show.plot?;
+    let sampled = metric.sampled.map(|column| line("sampled, training episodes", BLUE, points, column));
+    let greedy = metric.greedy().then(|| line("greedy evaluation", GREEN, points, metric.name));
+    let mut series: Vec<Series> = sampled.into_iter().chain(greedy).collect();
+    if let [_, greedy] = &mut series[..] {
+        greedy.dots = true;
+    }
+    let measured = series.iter().flat_map(|one| &one.points).any(|&(_, value)| value != 0.0);
+    (measured || metric.scope == Scope::EveryTask).then_some((metric, scale, series))
 }
 
-fn line(
-    label: &'static str,
-    color: RGBColor,
-    points: &[MetricsPoint],
-    value: impl Fn(&MetricsPoint) -> Option<f64>,
-) -> Series {
-    let place = |p: &MetricsPoint| value(p).filter(|y| y.is_finite()).map(|y| (p.joint_env_steps as f64, y));
+fn line(label: &'static str, color: RGBColor, points: &[MetricsPoint], column: &str) -> Series {
+    let place = |p: &MetricsPoint| p.get(column).filter(|y| y.is_finite()).map(|y| (p.joint_env_steps as f64, y));
     let points: Vec<_> = points.iter().filter_map(place).collect();
     Series { label, color, dots: points.len() <= 60, points }
 }
@@ -237,10 +217,11 @@ fn limits(scale: Scale, series: &[Series]) -> (f64, f64) {
     let low = match scale {
         Scale::Share | Scale::FromZero => smallest.min(0.0),
         Scale::FromOne => smallest.min(1.0),
+        Scale::Free => smallest,
     };
     let high = match scale {
         Scale::Share => largest.max(1.0),
-        Scale::FromZero => low + (largest - low) * 1.08,
+        Scale::FromZero | Scale::Free => low + (largest - low) * 1.08,
         // Differences below a percent are noise to look at, and their labels would all read the same.
         Scale::FromOne => low + ((largest - low) * 1.08).max(0.05),
     };
@@ -305,7 +286,7 @@ mod tests {
         let next = LINE.replace("\"iteration\":0", "\"iteration\":1");
         let points = parse_metrics(&format!("{LINE}\n{next}\n{again}\n\n{next}\n{{\"iter")).unwrap();
         assert_eq!(points.len(), 2, "the resumed iterations replace the old ones");
-        assert_eq!((points[0].success_rate, points[0].cost_ratio, points[0].reward), (Some(0.25), None, Some(-1.5)));
+        assert_eq!(["success_rate", "cost_ratio", "reward"].map(|c| points[0].get(c)), [Some(0.25), None, Some(-1.5)]);
         assert!(matches!(parse_metrics(""), Err(CurveError::Empty)));
         let error = parse_metrics(&format!("{LINE}\nnonsense\n")).unwrap_err().to_string();
         assert!(error.starts_with("metrics.jsonl line 2"), "{error}");
@@ -322,7 +303,7 @@ mod tests {
         };
         let points = parse_metrics(&(line("0.5", "0.25") + &line("0.75", "null"))).unwrap();
         assert_eq!(points.len(), 1);
-        assert_eq!((points[0].success_rate, points[0].sampled_success_rate), (Some(0.75), Some(0.25)));
+        assert_eq!(["success_rate", "sampled_success_rate"].map(|c| points[0].get(c)), [Some(0.75), Some(0.25)]);
     }
 
     #[test]
@@ -330,19 +311,19 @@ mod tests {
         let mut points = parse_metrics(&format!("{LINE}\n")).unwrap();
         let svg = curve_svg("a <run> & more", "N = 5", &points).unwrap();
         assert!(svg.contains("a &lt;run&gt; &amp; more") && svg.contains("no data yet") && svg.ends_with("</svg>\n"));
-        let base = points[0];
-        points.extend((1..300u64).map(|k| MetricsPoint {
-            iteration: k,
-            joint_env_steps: 1000 + 10_000 * k,
-            success_rate: (k % 10 == 0).then_some(f64::NAN),
-            sampled_success_rate: Some(k as f64 / 300.0),
-            collisions_per_agent_step: Some(0.0),
-            cost_ratio: Some(1.0),
-            arrival_step: Some(120.0),
-            ..base
-        }));
+        let more = |k: u64| {
+            let success = if k % 10 == 0 { "1.0" } else { "null" };
+            format!(
+                "{{\"iteration\":{k},\"joint_env_steps\":{},\"success_rate\":{success},\"sampled_success_rate\":0.{k},
+                  \"collisions_per_agent_step\":0.0,\"cost_ratio\":1.0,\"arrival_step\":120.0,\"second_cost_ratio\":null}}\n",
+                1000 + 10_000 * k
+            )
+            .replace("\n                  ", "")
+        };
+        points.extend(parse_metrics(&(1..300).map(more).collect::<String>()).unwrap());
         let svg = curve_svg("run", "", &points).unwrap();
         assert!(!svg.contains("NaN") && svg.contains("joint environment steps"));
+        assert!(svg.contains("arrival, steps") && !svg.contains("second cost"), "no panel without the metric");
         assert!(matches!(curve_svg("run", "", &[]), Err(CurveError::Empty)));
     }
 

@@ -3,6 +3,8 @@
 use serde_json::Value;
 use std::io::{IsTerminal as _, Write as _};
 
+pub(crate) use magex_core::metrics_table::share;
+
 /// Where results go. With `--json` standard output carries the JSON object alone, and what people read goes to standard error.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Output {
@@ -98,11 +100,6 @@ pub(crate) fn thousands(value: f64) -> String {
         out.push(digit);
     }
     if value < 0.0 && digits != "0" { format!("-{out}") } else { out }
-}
-
-/// A share between 0 and 1: four decimals, and never rounded up to 1.
-pub(crate) fn share(value: f64) -> String {
-    if value < 1.0 { format!("{:.4}", value.min(0.9999)) } else { format!("{value:.4}") }
 }
 
 /// A span of time.

@@ -1,12 +1,15 @@
 //! How a run shows itself while it goes: a table with a live status line on a terminal, log lines elsewhere.
 
 use crate::logging::set_live_line;
-use crate::output::{colours, note, share, thousands};
+use crate::output::{colours, note, thousands};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
-use magex_core::task::TaskName;
+use magex_core::metrics_table::{
+    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, SECOND_COST_RATIO, SUCCESS_RATE,
+};
 use magex_learner::run_events::RunEvent;
 use serde::Deserialize;
+use serde_json::Value;
 use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};
 
@@ -18,16 +21,27 @@ const PAGE: u32 = 40;
 struct Row {
     iteration: u32,
     joint_env_steps: u64,
-    success_rate: Option<f64>,
-    sampled_success_rate: Option<f64>,
-    arrival_step: Option<f64>,
-    collisions_per_agent_step: Option<f64>,
-    collision_rate: Option<f64>,
-    cost_ratio: Option<f64>,
-    second_cost_ratio: Option<f64>,
     timing: Shares,
     joint_steps_per_s: f64,
     wall_s: f64,
+    /// The columns of the episodes' metrics, among others.
+    #[serde(flatten)]
+    columns: serde_json::Map<String, Value>,
+}
+
+impl Row {
+    fn get(&self, column: &str) -> Option<f64> {
+        self.columns.get(column)?.as_f64()
+    }
+
+    /// A metric under its name in metrics.jsonl.
+    fn metric(&self, metric: usize) -> Option<f64> {
+        self.get(METRICS[metric].name)
+    }
+
+    fn sampled(&self, metric: usize) -> Option<f64> {
+        self.get(METRICS[metric].sampled?)
+    }
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -52,8 +66,8 @@ pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     rows: u32,
     target: f64,
-    /// Agents of the task can crash.
-    crashes: bool,
+    /// The metrics that have a column.
+    metrics: Vec<usize>,
     colours: bool,
     last_iteration: Option<Instant>,
     page: Option<String>,
@@ -63,7 +77,8 @@ impl Progress {
     /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
-        let crashes = config.task.name == TaskName::Drones;
+        let shown = |row: &usize| METRICS[*row].show.progress && METRICS[*row].applies(&config.task);
+        let metrics = (0..METRICS.len()).filter(shown).collect();
         let terminal = std::io::stderr().is_terminal();
         if !terminal {
             tracing::info!(
@@ -78,7 +93,7 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, crashes, colours: false, last_iteration: None, page: None };
+            return Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
         }
         let colours = colours();
         let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
@@ -92,7 +107,7 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, crashes, colours, last_iteration: None, page: None }
+        Self { bar: Some(bar), rows: 0, target, metrics, colours, last_iteration: None, page: None }
     }
 
     /// Something happened.
@@ -149,16 +164,18 @@ impl Progress {
     fn row(&mut self, row: &Row) {
         let [collect, update, commander, checkpoint] = row.timing.percent();
         let Some(bar) = &self.bar else {
+            // A log line has fixed fields: those worth following without the file.
+            let crashed = row.metric(COLLISION_RATE).filter(|_| self.metrics.contains(&COLLISION_RATE));
             tracing::info!(
                 iteration = row.iteration,
                 joint_env_steps = row.joint_env_steps,
-                success = row.success_rate.map(rounded),
-                sampled_success = row.sampled_success_rate.map(rounded),
-                arrival_step = row.arrival_step.map(rounded),
-                collisions_per_agent_step = row.collisions_per_agent_step.map(rounded),
-                collision_rate = row.collision_rate.filter(|_| self.crashes).map(rounded),
-                cost_ratio = row.cost_ratio.map(rounded),
-                second_cost_ratio = row.second_cost_ratio.map(rounded),
+                success = row.metric(SUCCESS_RATE).map(rounded),
+                sampled_success = row.sampled(SUCCESS_RATE).map(rounded),
+                arrival_step = row.metric(ARRIVAL_STEP).map(rounded),
+                collisions_per_agent_step = row.metric(COLLISIONS_PER_AGENT_STEP).map(rounded),
+                collision_rate = crashed.map(rounded),
+                cost_ratio = row.metric(COST_RATIO).map(rounded),
+                second_cost_ratio = row.metric(SECOND_COST_RATIO).map(rounded),
                 steps_per_s = row.joint_steps_per_s.round(),
                 collect_percent = collect.round(),
                 update_percent = update.round(),
@@ -169,14 +186,14 @@ impl Progress {
             return;
         };
         if self.rows.is_multiple_of(PAGE) {
-            let heading = heading(self.crashes);
+            let heading = heading(&self.metrics);
             note(if self.colours { format!("\x1b[2m{heading}\x1b[0m") } else { heading });
         }
         self.rows += 1;
-        let reached = row.success_rate.is_some_and(|success| success >= self.target);
-        note(line(row, [collect, update, commander, checkpoint], self.crashes, reached && self.colours));
+        let reached = row.metric(SUCCESS_RATE).is_some_and(|success| success >= self.target);
+        note(line(row, [collect, update, commander, checkpoint], &self.metrics, reached && self.colours));
         bar.set_position(row.joint_env_steps);
-        let next = if row.sampled_success_rate.is_none() {
+        let next = if row.sampled(SUCCESS_RATE).is_none() {
             "closing evaluation".into()
         } else {
             format!("iteration {}", row.iteration + 1)
@@ -191,40 +208,41 @@ impl Drop for Progress {
     }
 }
 
-fn heading(crashes: bool) -> String {
-    format!(
-        "{:>5} {:>10} {:>8} {:>8} {:>8} {:>10} {:>7} {:>8}  {}",
-        "iter",
-        "steps",
-        "success",
-        "sampled",
-        "arrival",
-        if crashes { "crashed" } else { "collisions" },
-        "cost",
-        "steps/s",
-        "time: collect update commander"
-    )
+/// Width of a metric's column.
+fn width(metric: usize) -> usize {
+    METRICS[metric].show.label.len().max(8)
 }
 
-fn line(row: &Row, percent: [f64; 4], crashes: bool, highlight: bool) -> String {
-    let cell = |value: Option<f64>, show: &dyn Fn(f64) -> String| value.map_or_else(|| "-".to_owned(), show);
-    let success = format!("{:>8}", cell(row.success_rate, &share));
-    let success = if highlight { format!("\x1b[32m{success}\x1b[0m") } else { success };
-    let speed = if row.sampled_success_rate.is_some() { thousands(row.joint_steps_per_s) } else { "-".to_owned() };
-    let times = if row.sampled_success_rate.is_some() {
-        format!("{:>11.0} % {:>4.0} % {:>7.0} %", percent[0], percent[1], percent[2])
-    } else {
-        "      evaluation only".to_owned()
+fn heading(metrics: &[usize]) -> String {
+    let mut text = format!("{:>5} {:>10}", "iter", "steps");
+    for &metric in metrics {
+        text += &format!(" {:>1$}", METRICS[metric].show.label, width(metric));
+        if metric == SUCCESS_RATE {
+            text += &format!(" {:>8}", "sampled");
+        }
+    }
+    text + &format!(" {:>8}  time: collect update commander", "steps/s")
+}
+
+fn line(row: &Row, percent: [f64; 4], metrics: &[usize], highlight: bool) -> String {
+    let cell = |metric: usize, value: Option<f64>| {
+        let text = value.map_or_else(|| "-".to_owned(), |value| METRICS[metric].write(value));
+        format!("{text:>0$}", width(metric))
     };
-    format!(
-        "{:>5} {:>10} {success} {:>8} {:>8} {:>10} {:>7} {speed:>8}  {times}",
-        row.iteration,
-        thousands(row.joint_env_steps as f64),
-        cell(row.sampled_success_rate, &share),
-        cell(row.arrival_step, &|x| format!("{x:.1}")),
-        cell(row.collision_rate.filter(|_| crashes).or(row.collisions_per_agent_step), &|x| format!("{x:.4}")),
-        cell(row.cost_ratio, &|x| format!("{x:.4}")),
-    )
+    let mut text = format!("{:>5} {:>10}", row.iteration, thousands(row.joint_env_steps as f64));
+    for &metric in metrics {
+        let value = cell(metric, row.metric(metric));
+        let highlight = highlight && metric == SUCCESS_RATE;
+        text += &if highlight { format!(" \x1b[32m{value}\x1b[0m") } else { format!(" {value}") };
+        if metric == SUCCESS_RATE {
+            text += &format!(" {}", cell(metric, row.sampled(metric)));
+        }
+    }
+    if row.sampled(SUCCESS_RATE).is_none() {
+        return text + &format!(" {:>8}        evaluation only", "-");
+    }
+    let speed = thousands(row.joint_steps_per_s);
+    text + &format!(" {speed:>8}  {:>11.0} % {:>4.0} % {:>7.0} %", percent[0], percent[1], percent[2])
 }
 
 /// To four decimals, for log lines.
@@ -236,6 +254,8 @@ fn rounded(value: f64) -> f64 {
 mod tests {
     use super::*;
 
+    const SHOWN: [usize; 4] = [SUCCESS_RATE, ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, COST_RATIO];
+
     #[test]
     fn a_line_of_the_metrics_file_becomes_a_row_below_its_heading() {
         let json = r#"{"iteration":12,"joint_env_steps":11520,"agent_steps":1,"success_rate":0.99996,
@@ -243,12 +263,12 @@ mod tests {
             "timing":{"collect_s":3.0,"executor_s":6.0,"commander_s":1.0,"checkpoint_s":0.0},
             "joint_steps_per_s":1234.5,"wall_s":9.0}"#;
         let row: Row = serde_json::from_str(json).unwrap();
-        let text = line(&row, row.timing.percent(), false, false);
+        let text = line(&row, row.timing.percent(), &SHOWN, false);
         assert_eq!(
             text,
-            "   12     11,520   0.9999   0.9700     61.2     0.0123  1.0004    1,234           30 %   60 %      10 %"
+            "   12     11,520   0.9999   0.9700     61.2     0.0123   1.0004    1,234           30 %   60 %      10 %"
         );
-        let heading = heading(false);
+        let heading = heading(&SHOWN);
         assert_eq!(heading.find("success").unwrap() + 7, text.find("0.9999").unwrap() + 6);
         assert_eq!(heading.len(), "    iter".len() - 3 + text.len() - 5);
     }
@@ -259,6 +279,6 @@ mod tests {
             "arrival_step":null,"collisions_per_agent_step":null,"cost_ratio":null,
             "timing":{"collect_s":0,"executor_s":0,"commander_s":0,"checkpoint_s":0},"joint_steps_per_s":0,"wall_s":1}"#;
         let row: Row = serde_json::from_str(json).unwrap();
-        assert!(line(&row, row.timing.percent(), false, true).contains(" - "));
+        assert!(line(&row, row.timing.percent(), &SHOWN, true).contains(" - "));
     }
 }

@@ -1,5 +1,6 @@
 //! The page over HTTP: `/`, and the JSON that its script asks for.
 
+use super::curve;
 use super::scene::{SCRIPT, base64};
 use super::state::LivePage;
 use axum::Router;
@@ -32,7 +33,7 @@ impl LivePage {
         self: &Arc<Self>,
         status: impl Fn() -> Option<v1::RunStatus> + Clone + Send + Sync + 'static,
     ) -> Router {
-        let html: Bytes = PAGE.replacen("@SCENE@", SCRIPT, 1).into();
+        let html: Bytes = PAGE.replacen("@METRICS@", &curve::plots(), 1).replacen("@SCENE@", SCRIPT, 1).into();
         let policy = policy(&html);
         let (run, rows, latest) = (self.clone(), self.clone(), self.clone());
         let page = move || {

@@ -4,6 +4,7 @@
 //! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
 //! and knows no task by name; three dimensions are seen from above, from the side and in space.
 
+use magex_core::metrics_table::{METRICS, Metric};
 use magex_core::task::{DroneConfig, Group, TaskConfig, TaskName};
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use serde::{Serialize, Serializer};
@@ -60,6 +61,9 @@ pub struct Scene {
     pub out: Option<usize>,
     /// [`UNIT`].
     pub unit: f64,
+    /// Whether the task has each of [`METRICS`].
+    #[serde(skip)]
+    pub metrics: [bool; METRICS.len()],
 }
 
 impl Scene {
@@ -89,6 +93,7 @@ impl Scene {
             up: flies.then_some(3),
             out: seen.out,
             unit: UNIT,
+            metrics: std::array::from_fn(|row| METRICS[row].applies(task)),
         }
     }
 
@@ -183,18 +188,14 @@ impl Scene {
         Ok(wide)
     }
 
-    /// What an episode scored, in words.
+    /// What an episode scored: heading and value of the metrics that a replay lists and the task has.
     pub fn facts(&self, metrics: &EpisodeMetrics) -> Vec<(&'static str, String)> {
-        let known = [
-            ("success at the start", Some(metrics.spawn_success)),
-            ("success at the end", Some(metrics.success)),
-            ("matched success", Some(metrics.matched_success)),
-            ("collision rate", self.out.map(|_| metrics.collision_rate)),
-            ("assignment cost ratio", Some(metrics.cost_ratio)),
-            ("second cost ratio", metrics.second_cost_ratio),
-            ("mean reward", Some(metrics.reward)),
-        ];
-        known.into_iter().filter_map(|(name, value)| value.map(|value| (name, format!("{value:.3}")))).collect()
+        let listed =
+            METRICS.iter().zip(&self.metrics).enumerate().filter(|(_, (metric, has))| metric.show.replay && **has);
+        let value = |(row, (metric, _)): (usize, (&Metric, &bool))| {
+            metrics.get(row).map(|value| (metric.show.label, metric.write(value.into())))
+        };
+        listed.filter_map(value).collect()
     }
 }
 
@@ -269,6 +270,7 @@ pub(crate) fn base64(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use magex_core::metrics_table::SECOND_COST_RATIO;
     use magex_core::task::Spawn;
 
     #[test]
@@ -305,26 +307,17 @@ mod tests {
 
     #[test]
     fn facts_that_a_task_does_not_have_are_left_out() {
-        let mut metrics = EpisodeMetrics {
-            success: 0.75,
-            matched_success: 0.5,
-            spawn_success: 0.125,
-            arrival_step: 61,
-            collisions_per_agent_step: 0.0,
-            collision_rate: 0.25,
-            reward: 0.5,
-            cost_ratio: 1.0,
-            second_cost_ratio: None,
-        };
+        let mut metrics = EpisodeMetrics([0.25; METRICS.len()]);
+        metrics[SECOND_COST_RATIO] = f32::NAN;
         let value = |name, metrics: &EpisodeMetrics, fact: &str| {
             let facts = Scene::of(&TaskConfig::of(name, 5, Spawn::Uniform)).facts(metrics);
             facts.into_iter().find(|(key, _)| *key == fact).map(|(_, value)| value)
         };
-        assert_eq!(value(TaskName::SimpleSpread, &metrics, "success at the start").as_deref(), Some("0.125"));
-        assert_eq!(value(TaskName::SimpleSpread, &metrics, "collision rate"), None);
-        assert_eq!(value(TaskName::SimpleSpread, &metrics, "second cost ratio"), None);
-        assert_eq!(value(TaskName::Drones, &metrics, "collision rate").as_deref(), Some("0.250"));
-        metrics.second_cost_ratio = Some(1.25);
-        assert_eq!(value(TaskName::PushBall, &metrics, "second cost ratio").as_deref(), Some("1.250"));
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "at spawn").as_deref(), Some("0.2500"));
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "crashed"), None);
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "second cost"), None);
+        assert_eq!(value(TaskName::Drones, &metrics, "crashed").as_deref(), Some("0.2500"));
+        metrics[SECOND_COST_RATIO] = 1.25;
+        assert_eq!(value(TaskName::PushBall, &metrics, "second cost").as_deref(), Some("1.2500"));
     }
 }

@@ -110,7 +110,7 @@ async fn the_page_lets_nothing_in_but_itself() {
     for word in ["default-src 'none'", "script-src 'sha256-", "style-src 'sha256-", "connect-src 'self'", "nosniff"] {
         assert!(head.contains(word), "{word}: {head}");
     }
-    assert!(!head.contains("unsafe-inline") && !body.contains("@SCENE@"));
+    assert!(!head.contains("unsafe-inline") && !body.contains("@SCENE@") && !body.contains("@METRICS@"));
     // What is asked for is relative; the only address in full is the name of SVG in the icon, which nobody fetches.
     assert!(!body.contains("src=") && !body.contains("@import") && !body.contains(" style="));
     assert_eq!(body.matches("<script>").count(), 1);

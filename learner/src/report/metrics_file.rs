@@ -8,65 +8,47 @@ use crate::train::commander_ppo::CommanderStats;
 use crate::train::mappo::UpdateStats;
 use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
+use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_core::trajectory::EpisodeMetrics;
-use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
+use serde::ser::SerializeMap as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+use std::collections::{BTreeMap, VecDeque};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// Means over episodes, a value for each row of [`METRICS`]; `None` for a metric that the task does not have.
+pub type Means = [Option<f64>; METRICS.len()];
+
 /// Means over the episodes of an evaluation, or of an iteration's training episodes.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EvalSummary {
     /// Episodes.
     pub episodes: usize,
-    /// Share of landmarks covered at the last step.
-    pub success_rate: f64,
-    /// Share of landmarks that can be matched one-to-one to agents at the last step.
-    pub matched_success_rate: f64,
-    /// Share of episodes with every landmark covered at the last step.
-    pub all_covered_rate: f64,
-    /// Mean first step with at least 99 % covered; episodes without one count with the horizon + 1.
-    pub arrival_step: f64,
-    /// Other agents closer than two radii, per agent and step.
-    pub collisions_per_agent_step: f64,
-    /// Mean reward per agent and step.
-    pub reward: f64,
-    /// Mean C_c / C_h of agents to their first goals.
-    pub cost_ratio: f64,
-    /// The same of the second stage, if the task has one.
-    pub second_cost_ratio: Option<f64>,
-    /// Mean share of landmarks that the spawn already covered.
-    pub spawn_success_rate: f64,
-    /// Mean share of agents that crashed.
-    pub collision_rate: f64,
+    /// Over these episodes.
+    pub means: Means,
 }
 
-/// Means in the order of the episodes; `None` if there are none.
+/// `episodes`, then every metric under its name.
+impl Serialize for EvalSummary {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("episodes", &self.episodes)?;
+        for (metric, mean) in METRICS.iter().zip(self.means) {
+            map.serialize_entry(metric.name, &mean)?;
+        }
+        map.end()
+    }
+}
+
+/// Means in the order of the episodes; `None` if there are none. A metric that an episode does not have has no mean.
 pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> Option<EvalSummary> {
     let episodes: Vec<&EpisodeMetrics> = episodes.into_iter().collect();
     let count = episodes.len();
-    if count == 0 {
-        return None;
-    }
-    let mean = |f: fn(&EpisodeMetrics) -> f64| episodes.iter().map(|e| f(e)).sum::<f64>() / count as f64;
-    Some(EvalSummary {
-        episodes: count,
-        success_rate: mean(|e| e.success.into()),
-        matched_success_rate: mean(|e| e.matched_success.into()),
-        all_covered_rate: mean(|e| if e.success >= 1.0 { 1.0 } else { 0.0 }),
-        arrival_step: mean(|e| e.arrival_step.into()),
-        collisions_per_agent_step: mean(|e| e.collisions_per_agent_step.into()),
-        reward: mean(|e| e.reward.into()),
-        cost_ratio: mean(|e| e.cost_ratio.into()),
-        second_cost_ratio: episodes
-            .iter()
-            .map(|e| e.second_cost_ratio.map(f64::from))
-            .sum::<Option<f64>>()
-            .map(|sum| sum / count as f64),
-        spawn_success_rate: mean(|e| e.spawn_success.into()),
-        collision_rate: mean(|e| e.collision_rate.into()),
-    })
+    let sum = |metric| episodes.iter().map(|e| e.get(metric).map(f64::from)).sum::<Option<f64>>();
+    let means = std::array::from_fn(|metric| sum(metric).map(|sum| sum / count as f64));
+    (count > 0).then_some(EvalSummary { episodes: count, means })
 }
 
 /// Where an iteration's wall time went, in seconds.
@@ -98,6 +80,39 @@ impl Timing {
     }
 }
 
+/// What an iteration's episodes scored.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IterationMeans {
+    /// Greedy evaluation of the weights that the iteration started with.
+    pub greedy: Option<EvalSummary>,
+    /// Training episodes: sampled actions and goals.
+    pub sampled: Option<EvalSummary>,
+}
+
+impl IterationMeans {
+    /// A row of [`METRICS`] as metrics.jsonl has it under its name: greedy, unless only its sampled column is there.
+    pub fn get(&self, metric: usize) -> Option<f64> {
+        let source = if METRICS[metric].greedy() { &self.greedy } else { &self.sampled };
+        source.and_then(|summary| summary.means[metric])
+    }
+}
+
+/// The greedy columns, then the sampled ones.
+impl Serialize for IterationMeans {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        for (row, metric) in METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy()) {
+            map.serialize_entry(metric.name, &self.get(row))?;
+        }
+        for (row, metric) in METRICS.iter().enumerate() {
+            if let Some(column) = metric.sampled {
+                map.serialize_entry(column, &self.sampled.and_then(|summary| summary.means[row]))?;
+            }
+        }
+        map.end()
+    }
+}
+
 /// One line of metrics.jsonl. Fields of an evaluation are null on iterations without one; fields of training are null on
 /// the last line, which only evaluates.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -108,34 +123,9 @@ pub struct IterationMetrics {
     pub joint_env_steps: u64,
     /// Agent steps trained on.
     pub agent_steps: u64,
-    /// Greedy evaluation of the weights that this iteration started with.
-    pub success_rate: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub matched_success_rate: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub all_covered_rate: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub arrival_step: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub collisions_per_agent_step: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub collision_rate: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub spawn_success_rate: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub cost_ratio: Option<f64>,
-    /// Greedy evaluation: see [`EvalSummary`].
-    pub second_cost_ratio: Option<f64>,
-    /// Training episodes (sampled actions).
-    pub sampled_success_rate: Option<f64>,
-    /// Training episodes.
-    pub sampled_collisions_per_agent_step: Option<f64>,
-    /// Training episodes.
-    pub sampled_collision_rate: Option<f64>,
-    /// Training episodes (sampled goals).
-    pub sampled_cost_ratio: Option<f64>,
-    /// Training episodes: mean reward per agent and step.
-    pub reward: Option<f64>,
+    /// What its episodes scored.
+    #[serde(flatten)]
+    pub episodes: IterationMeans,
     /// Executor update.
     pub executor: Option<UpdateStats>,
     /// Commander update.
@@ -160,27 +150,12 @@ impl IterationMetrics {
         wall_s: f64,
     ) -> Self {
         let seconds = timing.seconds();
-        let eval = |f: fn(&EvalSummary) -> f64| evaluation.as_ref().map(f);
-        let train = |f: fn(&EvalSummary) -> f64| training.as_ref().map(f);
         let steps = if training.is_some() { config.steps_per_iteration() as f64 } else { 0.0 };
         Self {
             iteration: progress.iteration,
             joint_env_steps: progress.joint_env_steps,
             agent_steps: progress.joint_env_steps * config.task.agents as u64,
-            success_rate: eval(|e| e.success_rate),
-            matched_success_rate: eval(|e| e.matched_success_rate),
-            all_covered_rate: eval(|e| e.all_covered_rate),
-            arrival_step: eval(|e| e.arrival_step),
-            collisions_per_agent_step: eval(|e| e.collisions_per_agent_step),
-            collision_rate: eval(|e| e.collision_rate),
-            spawn_success_rate: eval(|e| e.spawn_success_rate),
-            cost_ratio: eval(|e| e.cost_ratio),
-            second_cost_ratio: evaluation.as_ref().and_then(|e| e.second_cost_ratio),
-            sampled_success_rate: train(|e| e.success_rate),
-            sampled_collisions_per_agent_step: train(|e| e.collisions_per_agent_step),
-            sampled_collision_rate: train(|e| e.collision_rate),
-            sampled_cost_ratio: train(|e| e.cost_ratio),
-            reward: train(|e| e.reward),
+            episodes: IterationMeans { greedy: evaluation, sampled: training },
             executor: updates.map(|u| u.0),
             commander: updates.map(|u| u.1),
             timing,
@@ -190,29 +165,47 @@ impl IterationMetrics {
     }
 }
 
+/// What the closing evaluations scored.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClosingMeans {
+    /// Greedy evaluation. Metrics that metrics.jsonl has of training episodes only are left out of summary.json.
+    pub greedy: Means,
+    /// Success rate of the sampled evaluation.
+    pub sampled_success_rate: Option<f64>,
+}
+
+const SAMPLED_SUCCESS_RATE: &str = "sampled_success_rate";
+
+impl Serialize for ClosingMeans {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        for (row, metric) in METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy()) {
+            map.serialize_entry(metric.name, &self.greedy[row])?;
+            if row == SUCCESS_RATE {
+                map.serialize_entry(SAMPLED_SUCCESS_RATE, &self.sampled_success_rate)?;
+            }
+        }
+        map.end()
+    }
+}
+
+impl<'de> Deserialize<'de> for ClosingMeans {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let values = BTreeMap::<String, Value>::deserialize(deserializer)?;
+        let number = |name: &str| values.get(name).and_then(Value::as_f64);
+        Ok(Self {
+            greedy: std::array::from_fn(|row| number(METRICS[row].name)),
+            sampled_success_rate: number(SAMPLED_SUCCESS_RATE),
+        })
+    }
+}
+
 /// What a finished run achieved: the evaluation that closes it, on spawns never seen before.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Greedy: share of landmarks covered at the last step.
-    pub success_rate: f64,
-    /// Sampled: the same.
-    pub sampled_success_rate: f64,
-    /// Greedy: one-to-one matched.
-    pub matched_success_rate: f64,
-    /// Greedy: share of episodes with every landmark covered.
-    pub all_covered_rate: f64,
-    /// Greedy: mean first step with at least 99 % covered.
-    pub arrival_step: f64,
-    /// Greedy.
-    pub collisions_per_agent_step: f64,
-    /// Greedy: mean share of agents that crashed.
-    pub collision_rate: f64,
-    /// Greedy: mean share of landmarks that the spawn already covered.
-    pub spawn_success_rate: f64,
-    /// Greedy: mean C_c / C_h.
-    pub cost_ratio: f64,
-    /// Greedy: the same of the second stage, if the task has one.
-    pub second_cost_ratio: Option<f64>,
+    /// What its episodes scored.
+    #[serde(flatten)]
+    pub episodes: ClosingMeans,
     /// Joint environment steps trained on.
     pub joint_env_steps: u64,
     /// Agent steps trained on.
@@ -251,16 +244,7 @@ impl Summary {
         weights_sha256: String,
     ) -> Self {
         Self {
-            success_rate: greedy.success_rate,
-            sampled_success_rate: sampled.success_rate,
-            matched_success_rate: greedy.matched_success_rate,
-            all_covered_rate: greedy.all_covered_rate,
-            arrival_step: greedy.arrival_step,
-            collisions_per_agent_step: greedy.collisions_per_agent_step,
-            collision_rate: greedy.collision_rate,
-            spawn_success_rate: greedy.spawn_success_rate,
-            cost_ratio: greedy.cost_ratio,
-            second_cost_ratio: greedy.second_cost_ratio,
+            episodes: ClosingMeans { greedy: greedy.means, sampled_success_rate: sampled.means[SUCCESS_RATE] },
             joint_env_steps: progress.joint_env_steps,
             agent_steps: progress.joint_env_steps * config.task.agents as u64,
             wall_s,
@@ -410,10 +394,34 @@ impl Lines {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use magex_core::metrics_table::{REWARD, SECOND_COST_RATIO};
     use std::os::unix::fs::MetadataExt as _;
 
     fn line(iteration: u32) -> String {
         format!("{{\"iteration\":{iteration},\"executor\":{{}}}}\n")
+    }
+
+    /// The names and their order, which other programs read.
+    #[test]
+    fn metrics_of_episodes_have_their_names_and_order() {
+        let mut episode = EpisodeMetrics([0.25; METRICS.len()]);
+        let first = episode;
+        (episode[SUCCESS_RATE], episode[SECOND_COST_RATIO]) = (0.75, f32::NAN);
+        let summary = summarise([&first, &episode]).unwrap();
+        assert_eq!((summary.episodes, summary.means[SUCCESS_RATE], summary.means[REWARD]), (2, Some(0.5), Some(0.25)));
+        assert_eq!(summarise([]), None);
+        let greedy = "\"success_rate\":0.5,\"matched_success_rate\":0.25,\"all_covered_rate\":0.25,\"arrival_step\":0.25,\
+            \"collisions_per_agent_step\":0.25,\"collision_rate\":0.25,\"spawn_success_rate\":0.25,\"cost_ratio\":0.25,\
+            \"second_cost_ratio\":null";
+        let sampled = "\"sampled_success_rate\":null,\"sampled_collisions_per_agent_step\":null,\
+            \"sampled_collision_rate\":null,\"sampled_cost_ratio\":null,\"reward\":null";
+        let line = serde_json::to_string(&IterationMeans { greedy: Some(summary), sampled: None }).unwrap();
+        assert_eq!(line, format!("{{{greedy},{sampled}}}"));
+        let mut closing = ClosingMeans { greedy: summary.means, sampled_success_rate: Some(0.125) };
+        let line = serde_json::to_string(&closing).unwrap();
+        assert_eq!(line, format!("{{{}}}", greedy.replacen(",", ",\"sampled_success_rate\":0.125,", 1)));
+        closing.greedy[REWARD] = None;
+        assert_eq!(serde_json::from_str::<ClosingMeans>(&line).unwrap(), closing);
     }
 
     #[test]

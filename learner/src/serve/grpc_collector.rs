@@ -6,6 +6,7 @@ use crate::report::metrics_file::IterationMetrics;
 use crate::run_events::{CollectError, IterationReport, RunEvent, StopReason};
 use crate::serve::shared::Shared;
 use magex_core::ids::{Shard, ShardKind};
+use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::weights::Weights;
 use magex_runtime::sync::lock;
@@ -88,8 +89,8 @@ impl Collector for GrpcCollector {
         tracing::info!(
             iteration = metrics.iteration,
             joint_env_steps = metrics.joint_env_steps,
-            success_rate = metrics.success_rate,
-            reward = metrics.reward,
+            success_rate = metrics.episodes.get(SUCCESS_RATE),
+            reward = metrics.episodes.get(REWARD),
             bound_by = bound.by.name(),
             actor_s = bound.actor_s,
             learner_s = bound.learner_s,

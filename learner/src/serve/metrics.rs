@@ -3,6 +3,7 @@
 use crate::report::bottleneck::BoundBy;
 use crate::report::metrics_file::IterationMetrics;
 use crate::serve::ledger;
+use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
 use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Held, Metrics, Seconds, SecondsBy};
@@ -161,10 +162,10 @@ impl LearnerGauges {
         if let Some(update) = &metrics.executor {
             self.skipped.add(update.skipped as u64);
         }
-        if let Some(success) = metrics.success_rate {
+        if let Some(success) = metrics.episodes.get(SUCCESS_RATE) {
             self.success.set(success);
         }
-        if let Some(reward) = metrics.reward {
+        if let Some(reward) = metrics.episodes.get(REWARD) {
             self.reward.set(reward);
         }
     }

@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard};
+use magex_core::metrics_table::METRICS;
 use magex_core::task::TaskConfig;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
@@ -13,6 +14,8 @@ pub struct Limits {
     pub shape: Shape,
     /// Choices of each action component.
     pub action_heads: Vec<usize>,
+    /// Whether the task has each of [`METRICS`]; one that it does not have may be absent.
+    pub metrics: [bool; METRICS.len()],
     /// Actors connected at the same time.
     pub max_actors: usize,
     /// Open streams of weights and of events, at the same time.
@@ -24,7 +27,8 @@ impl Limits {
     pub fn for_task(task: &TaskConfig, max_episodes: usize) -> Self {
         let action_heads = task.action_heads();
         let shape = task.shape(max_episodes);
-        Self { shape, action_heads, max_actors: 256, max_watchers: 1024 }
+        let metrics = std::array::from_fn(|row| METRICS[row].applies(task));
+        Self { shape, action_heads, metrics, max_actors: 256, max_watchers: 1024 }
     }
 
     /// Longest encoded result, bytes: its arrays, and a generous envelope.
@@ -34,8 +38,9 @@ impl Limits {
         let state = (t + 1) * b * s.bodies * s.dims;
         let agent_state = (t + 1) * b * n * s.agent_state;
         let floats = 2 * state + agent_state + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b * s.goals_per_agent;
+        let metrics = b * METRICS.len();
         let goals = b * n * s.goals_per_agent;
-        4 * (floats + goals) + t * b * n * s.action_components + 96 * b + 64 * 1024
+        4 * (floats + metrics + goals) + t * b * n * s.action_components + 64 * 1024
     }
 }
 
@@ -77,7 +82,7 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
         }
     }
     check_one_to_one(trajectory)?;
-    check_metrics("trajectory.metrics", &trajectory.metrics)
+    check_metrics("trajectory.metrics", limits, &trajectory.metrics)
 }
 
 /// Every agent has goals of its own, in every stage.
@@ -99,11 +104,7 @@ fn check_one_to_one(trajectory: &Trajectory) -> Result<(), ConvertError> {
 }
 
 fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError> {
-    let (found, expected) = (outcome.metrics.len(), outcome.shard.episodes as usize);
-    if found != expected {
-        return Err(ConvertError::new("eval.metrics", format!("{found} episodes where {expected} are expected")));
-    }
-    check_metrics("eval.metrics", &outcome.metrics)?;
+    check_metrics("eval.metrics", limits, &outcome.metrics)?;
     match (&outcome.recording, outcome.shard.record) {
         (Some(recording), true) => check_recording(limits, recording),
         (None, false) => Ok(()),
@@ -142,20 +143,18 @@ fn check_shape(field: &str, shape: &Shape, limits: &Limits, episodes: usize) -> 
     Err(ConvertError::new(field, format!("{shape:?} where the task has {expected:?}")))
 }
 
-fn check_metrics(field: &str, metrics: &[EpisodeMetrics]) -> Result<(), ConvertError> {
-    for (place, m) in metrics.iter().enumerate() {
-        let named = [
-            ("success", m.success),
-            ("matched_success", m.matched_success),
-            ("spawn_success", m.spawn_success),
-            ("collision_rate", m.collision_rate),
-            ("second_cost_ratio", m.second_cost_ratio.unwrap_or(0.0)),
-            ("collisions_per_agent_step", m.collisions_per_agent_step),
-            ("reward", m.reward),
-            ("cost_ratio", m.cost_ratio),
-        ];
-        if let Some((name, value)) = named.into_iter().find(|(_, value)| !value.is_finite()) {
-            return Err(ConvertError::new(format!("{field}[{place}].{name}"), format!("{value} is not finite")));
+fn check_metrics(field: &str, limits: &Limits, episodes: &[EpisodeMetrics]) -> Result<(), ConvertError> {
+    for (place, episode) in episodes.iter().enumerate() {
+        for ((metric, &value), &has) in METRICS.iter().zip(&episode.0).zip(&limits.metrics) {
+            let [low, high] = metric.range;
+            let problem = if value.is_nan() && !has || (low..=high).contains(&value) {
+                continue;
+            } else if !value.is_finite() {
+                format!("{value} is not finite")
+            } else {
+                format!("{value} is outside {low}..={high}")
+            };
+            return Err(ConvertError::new(format!("{field}[{place}].{}", metric.name), problem));
         }
     }
     Ok(())
@@ -170,6 +169,7 @@ pub(crate) fn describe(shard: &Shard) -> String {
 mod tests {
     use super::*;
     use crate::fixtures::{eval_outcome, task, train_shard, trajectory};
+    use magex_core::metrics_table::{REWARD, SECOND_COST_RATIO, SUCCESS_RATE};
     use magex_proto::convert::encode_result;
 
     fn limits() -> Limits {
@@ -204,7 +204,9 @@ mod tests {
         check(|t| t.log_probs[0] = 0.5, "trajectory.log_probs[0]: 0.5 is above 0");
         check(|t| t.actions[3] = 5, "trajectory.actions[3]: 5 is not below 5");
         check(|t| t.goals[0] = 99, "trajectory.goals[0]: 99 is not below");
-        check(|t| t.metrics[1].reward = f32::NAN, "trajectory.metrics[1].reward: NaN");
+        check(|t| t.metrics[1][REWARD] = f32::NAN, "trajectory.metrics[1].reward: NaN is not finite");
+        check(|t| t.metrics[0][SUCCESS_RATE] = 1.5, "trajectory.metrics[0].success_rate: 1.5 is outside 0..=1");
+        check(|t| t.metrics[0][SECOND_COST_RATIO] = f32::INFINITY, "trajectory.metrics[0].second_cost_ratio: inf");
         check(|t| t.shard.episodes = 5, "shard.episodes: 5 is outside 1..=4");
         check(|t| t.shard.episodes = 1, "trajectory.shape: ");
         let other =

@@ -9,6 +9,7 @@ use magex_commander::scheduler::{
 };
 use magex_commander::service::CommanderConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::METRICS;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
@@ -73,17 +74,8 @@ pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> Sha
     let tag = weights.iter().map(|&byte| u32::from(byte)).sum();
     let mut stream = Key::new(SEED, Purpose::Action, &[shard.iteration.0, shard.index, tag]).stream();
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| stream.uniform32()).collect() };
-    let metrics = EpisodeMetrics {
-        success: 1.0,
-        matched_success: 1.0,
-        spawn_success: 0.0,
-        collision_rate: 0.0,
-        second_cost_ratio: None,
-        arrival_step: 1,
-        collisions_per_agent_step: 0.0,
-        reward: 0.5,
-        cost_ratio: 1.0,
-    };
+    // A value that every metric may have.
+    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
     ShardResult::Train(Trajectory {
         shard: *shard,
         shape,

@@ -5,9 +5,14 @@ use super::linalg::{V3, norm, scale, sub};
 use super::model::State;
 use super::world::{Drone, Laws, World};
 use super::{ACCELERATION, COVER_RADIUS, MOST_SPEED};
-use crate::env::Score;
+use crate::env::all_covered;
 use crate::matching::maximum_matching;
+use magex_core::metrics_table::{
+    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
+    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::task::DroneConfig;
+use magex_core::trajectory::EpisodeMetrics;
 
 /// An episode.
 pub(super) struct Episode {
@@ -156,20 +161,22 @@ impl Episode {
     }
 
     /// The score after `steps` commands of an episode of `horizon`.
-    pub(super) fn score(&self, steps: u32, horizon: u32, landmarks: &[f32]) -> Score {
+    pub(super) fn score(&self, steps: u32, horizon: u32, landmarks: &[f32]) -> EpisodeMetrics {
         let n = self.world.drones.len();
         let near = self.near(landmarks);
         let commands = f64::from(steps.max(1));
         let crashed = self.world.drones.iter().filter(|drone| drone.is_out()).count() as f64 / n as f64;
-        Score {
-            success: share(covered(&near), n),
-            matched_success: share(maximum_matching(&near, n), n),
-            spawn_success: self.spawn_success,
-            arrival_step: if self.arrival > 0 { self.arrival } else { horizon + 1 },
-            collisions_per_agent_step: (crashed / commands) as f32,
-            collision_rate: crashed as f32,
-            reward: (self.reward / (commands * n as f64)) as f32,
-        }
+        let success = share(covered(&near), n);
+        EpisodeMetrics::of([
+            (SUCCESS_RATE, success),
+            (MATCHED_SUCCESS_RATE, share(maximum_matching(&near, n), n)),
+            (ALL_COVERED_RATE, all_covered(success)),
+            (SPAWN_SUCCESS_RATE, self.spawn_success),
+            (ARRIVAL_STEP, if self.arrival > 0 { self.arrival } else { horizon + 1 } as f32),
+            (COLLISIONS_PER_AGENT_STEP, (crashed / commands) as f32),
+            (COLLISION_RATE, crashed as f32),
+            (REWARD, (self.reward / (commands * n as f64)) as f32),
+        ])
     }
 }
 

@@ -2,6 +2,9 @@ use super::model::State;
 use super::world::{Crash, Drone, World};
 use super::*;
 use crate::env::View;
+use magex_core::metrics_table::{
+    ARRIVAL_STEP, COLLISION_RATE, MATCHED_SUCCESS_RATE, REWARD, SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Downwash, Spawn};
 use proptest::prelude::*;
@@ -123,8 +126,8 @@ fn scripted(task: &TaskConfig, episodes: u32) -> (Drones, [f32; 2]) {
         drones.step(&actions, &mut vec![0.0; numbers]).unwrap();
     }
     let scores = drones.scores();
-    let mean = |of: fn(&Score) -> f32| scores.iter().map(of).sum::<f32>() / scores.len() as f32;
-    let means = [mean(|score| score.success), mean(|score| score.collision_rate)];
+    let mean = |of: fn(&EpisodeMetrics) -> f32| scores.iter().map(of).sum::<f32>() / scores.len() as f32;
+    let means = [mean(|score| score[SUCCESS_RATE]), mean(|score| score[COLLISION_RATE])];
     (drones, means)
 }
 
@@ -231,7 +234,7 @@ proptest! {
             prop_assert!(a.finite() && b.finite());
             // From a contact on, and be it one that rapier foresees and that then is none, its answer depends on what it
             // remembers of the pair.
-            if lazy.scores()[0].collision_rate > 0.0 || always.scores()[0].collision_rate > 0.0 {
+            if lazy.scores()[0][COLLISION_RATE] > 0.0 || always.scores()[0][COLLISION_RATE] > 0.0 {
                 break;
             }
             prop_assert_eq!(a.bits(), b.bits(), "command {}: {:?} {:?}", k, a, b);
@@ -270,9 +273,9 @@ fn the_reward_is_the_documented_sum() {
         }
     }
     let score = drones.scores()[0];
-    assert!((f64::from(score.reward) - sum / 10.0).abs() < 1e-6);
-    assert_eq!((score.success, score.matched_success, score.spawn_success), (0.5, 0.5, 0.5));
-    assert_eq!((score.arrival_step, score.collision_rate), (121, 0.0));
+    assert!((f64::from(score[REWARD]) - sum / 10.0).abs() < 1e-6);
+    assert_eq!((score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE]), (0.5, 0.5, 0.5));
+    assert_eq!((score[ARRIVAL_STEP], score[COLLISION_RATE]), (121.0, 0.0));
 }
 
 #[test]
@@ -280,7 +283,7 @@ fn two_landmarks_beside_one_drone_match_once() {
     let landmarks = [0.0, 0.1, 1.5, 0.0, -0.1, 1.5];
     let drones = Drones::from_state(&task(2), &[0.0, 0.0, 1.5, 2.0, 0.0, 1.5], &[0.0; 6], &landmarks).unwrap();
     let score = drones.scores()[0];
-    assert_eq!((score.success, score.matched_success, score.spawn_success), (1.0, 0.5, 1.0));
+    assert_eq!((score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE]), (1.0, 0.5, 1.0));
 }
 
 #[test]

@@ -59,7 +59,7 @@ fn the_reward_is_the_documented_one_of_the_step() {
             let expected = 2.0 * (potential(&now) - potential(before)) + bonus;
             assert!((f64::from(rewards[b]) - expected).abs() < 2e-5, "{action} {b}: {} {expected}", rewards[b]);
         }
-        assert!((env.scores()[0].reward - rewards[0]).abs() < 1e-6 && env.steps() == 1 && task.horizon > 1);
+        assert!((env.scores()[0][REWARD] - rewards[0]).abs() < 1e-6 && env.steps() == 1 && task.horizon > 1);
     }
 }
 
@@ -142,13 +142,17 @@ fn success_takes_any_ball_and_matched_success_the_own_one() {
     };
     for (goals, own) in [([0, 0, 1, 1, 2, 2], 1.0 / 3.0), ([0, 1, 1, 0, 2, 2], 1.0), ([2, 2, 2, 2, 2, 2], 1.0 / 3.0)] {
         let score = play(&goals);
-        assert_eq!((score.success, score.matched_success, score.spawn_success), (1.0, own, 1.0), "{goals:?}");
-        assert_eq!((score.arrival_step, score.collision_rate), (1, 0.0));
+        assert_eq!(
+            (score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE]),
+            (1.0, own, 1.0),
+            "{goals:?}"
+        );
+        assert_eq!((score[ARRIVAL_STEP], score[COLLISION_RATE]), (1.0, 0.0));
     }
-    assert_eq!(start.scores()[0].matched_success, 0.0);
+    assert_eq!(start.scores()[0][MATCHED_SUCCESS_RATE], 0.0);
     let apart = [0.0, 0.2, 1.0, 0.2, -1.0, -0.31];
     let env = PushBall::from_state(&task, &positions, &[0.0; 12], &apart).unwrap();
-    assert_eq!((env.scores()[0].success, env.scores()[0].arrival_step), (2.0 / 3.0, task.horizon + 1));
+    assert_eq!((env.scores()[0][SUCCESS_RATE], env.scores()[0][ARRIVAL_STEP]), (2.0 / 3.0, (task.horizon + 1) as f32));
 }
 
 #[test]
@@ -163,7 +167,7 @@ fn collisions_are_those_of_agents_among_themselves() {
     env.step(&[0; 3], &mut [0.0; 3]).unwrap();
     let p = env.positions();
     assert!(libm::hypotf(p[4] - p[6], p[5] - p[7]) < 0.25 && p[9] - p[7] < 0.3, "{p:?}");
-    assert_eq!(env.scores()[0].collisions_per_agent_step, 2.0 / 3.0);
+    assert_eq!(env.scores()[0][COLLISIONS_PER_AGENT_STEP], 2.0 / 3.0);
 }
 
 /// Everything an episode produces with random actions.
@@ -178,8 +182,8 @@ fn run(env: &mut PushBall, goals: &[u32], seed: u32, steps: u32, table: impl Fn(
         log.extend([bits(&env.positions()), bits(&env.velocities()), bits(&rewards)]);
     }
     for score in env.scores() {
-        log.push(bits(&[score.success, score.matched_success, score.spawn_success, score.reward]));
-        log.push(vec![score.arrival_step, score.collisions_per_agent_step.to_bits()]);
+        log.push(bits(&[score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE], score[REWARD]]));
+        log.push(bits(&[score[ARRIVAL_STEP], score[COLLISIONS_PER_AGENT_STEP]]));
     }
     log
 }
@@ -253,7 +257,7 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
             }
         }
         assert_eq!(arrives, expected < 12);
-        assert_eq!(env.scores()[0].arrival_step, expected, "N = {agents}, {missing} missing");
+        assert_eq!(env.scores()[0][ARRIVAL_STEP], expected as f32, "N = {agents}, {missing} missing");
     }
 }
 

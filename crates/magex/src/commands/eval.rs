@@ -5,10 +5,11 @@ use crate::cli::Global;
 use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
 use crate::failure::usage;
 use crate::folder;
-use crate::output::{Table, note, seconds, share};
+use crate::output::{Table, note, seconds};
 use crate::settings;
 use magex_core::ids::Mode;
-use magex_core::task::{Spawn, TaskConfig, TaskName};
+use magex_core::metrics_table::METRICS;
+use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::metrics_file::{EvalSummary, summarise};
 use magex_runtime::exit;
@@ -128,18 +129,17 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
     }
 
     let mut means = Map::new();
-    let columns = columns(&config.task);
-    let heading: Vec<&str> =
-        ["spawn", "seed", "mode"].into_iter().chain(columns.iter().map(|column| column.0)).collect();
+    let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.show.label);
+    let heading: Vec<&str> = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
-        table.row(cells(&columns, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary));
+        table.row(cells(&config.task, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary));
     }
     for &mode in modes.list() {
         let of_mode = all.iter().filter(|(m, _)| *m == mode).flat_map(|(_, metrics)| metrics);
         let Some(summary) = summarise(of_mode) else { continue };
         if rows.len() > modes.list().len() {
-            table.row(cells(&columns, ["all".into(), String::new()], mode, &summary));
+            table.row(cells(&config.task, ["all".into(), String::new()], mode, &summary));
         }
         means.insert(mode_name(mode).into(), serde_json::to_value(&summary)?);
     }
@@ -171,33 +171,11 @@ fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
     }
 }
 
-/// A number of the table: its heading, and how it is written.
-type Column = (&'static str, fn(&EvalSummary) -> String);
-
-/// What says something about a task.
-fn columns(task: &TaskConfig) -> Vec<Column> {
-    let mut columns: Vec<Column> = vec![
-        ("episodes", |s| s.episodes.to_string()),
-        ("success", |s| share(s.success_rate)),
-        ("matched", |s| share(s.matched_success_rate)),
-        ("all covered", |s| share(s.all_covered_rate)),
-        ("at spawn", |s| share(s.spawn_success_rate)),
-        ("arrival", |s| format!("{:.1}", s.arrival_step)),
-        ("collisions", |s| format!("{:.4}", s.collisions_per_agent_step)),
-    ];
-    if task.name == TaskName::Drones {
-        columns.push(("crashed", |s| format!("{:.4}", s.collision_rate)));
-    }
-    columns.push(("cost", |s| format!("{:.4}", s.cost_ratio)));
-    if task.stages().len() > 1 {
-        columns.push(("second cost", |s| s.second_cost_ratio.map_or_else(String::new, |x| format!("{x:.4}"))));
-    }
-    columns.push(("reward", |s| format!("{:.3}", s.reward)));
-    columns
-}
-
-fn cells(columns: &[Column], [spawn, seed]: [String; 2], mode: Mode, summary: &EvalSummary) -> Vec<String> {
-    [spawn, seed, mode_name(mode).into()].into_iter().chain(columns.iter().map(|column| column.1(summary))).collect()
+/// The numbers of a row: episodes, then the metrics of the task.
+fn cells(task: &TaskConfig, [spawn, seed]: [String; 2], mode: Mode, summary: &EvalSummary) -> Vec<String> {
+    let metrics = METRICS.iter().zip(summary.means).filter(|(metric, _)| metric.applies(task));
+    let values = metrics.map(|(metric, mean)| mean.map_or_else(String::new, |mean| metric.write(mean)));
+    [spawn, seed, mode_name(mode).into(), summary.episodes.to_string()].into_iter().chain(values).collect()
 }
 
 fn value(row: &Row) -> serde_json::Result<Value> {

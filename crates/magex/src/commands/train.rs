@@ -5,18 +5,18 @@ use crate::cli::Global;
 use crate::failure::{coded, usage};
 use crate::folder;
 use crate::local::LocalCollector;
-use crate::output::{Output, note, program, seconds, share, thousands};
+use crate::output::{Output, note, program, seconds, thousands};
 use crate::progress::Progress;
 use crate::settings::{self, Overrides};
 use crate::supervise::{self, Crew};
 use anyhow::Context as _;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
-use magex_core::task::TaskName;
+use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_learner::page::{LivePage, RunInfo};
+use magex_learner::report::metrics_file::Summary;
 use magex_learner::trainer::{Outcome, TrainError, Trainer};
 use magex_runtime::{backoff, exit, http, server, shutdown};
-use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -256,25 +256,6 @@ pub(crate) fn trainer(job: &Job) -> Result<Trainer, TrainError> {
     Ok(trainer)
 }
 
-/// What `summary.json` says that people are told.
-#[derive(Debug, Deserialize)]
-struct Summary {
-    success_rate: f64,
-    sampled_success_rate: f64,
-    all_covered_rate: f64,
-    arrival_step: f64,
-    collisions_per_agent_step: f64,
-    collision_rate: f64,
-    cost_ratio: f64,
-    second_cost_ratio: Option<f64>,
-    joint_env_steps: u64,
-    iterations: u32,
-    final_episodes: u32,
-    target_reached: bool,
-    wall_s: f64,
-    weights_sha256: String,
-}
-
 /// Seconds since the command began.
 struct Walls {
     /// Until its end.
@@ -288,32 +269,25 @@ fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, outpu
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     let mut value: Value = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
     let s: Summary = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
-    let (horizon, episodes) = (job.config.task.horizon, s.final_episodes);
     let why = if s.target_reached { "target reached" } else { "budget spent" };
-    let rows = [
-        ("success rate", format!("{} greedy   {} sampled", share(s.success_rate), share(s.sampled_success_rate))),
-        ("all covered", share(s.all_covered_rate)),
-        ("arrival step", format!("{:.1} of {horizon}", s.arrival_step)),
-        ("collisions", format!("{:.4} per agent and step", s.collisions_per_agent_step)),
-        ("collision rate", format!("{:.4} of the agents crashed", s.collision_rate)),
-        (
-            "assignment cost",
-            match s.second_cost_ratio {
-                None => format!("{:.4} of the exact one", s.cost_ratio),
-                Some(second) => format!("{:.4} and {second:.4} of the exact ones", s.cost_ratio),
-            },
-        ),
+    let sampled = METRICS[SUCCESS_RATE].write(s.episodes.sampled_success_rate.unwrap_or_default());
+    let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&job.config.task));
+    let mut rows: Vec<(&str, String)> = metrics
+        .filter_map(|(metric, mean)| Some((metric.show.label, format!("{} {}", metric.write(mean?), metric.unit))))
+        .collect();
+    rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
+    rows.extend([
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
         (
             "wall time",
             format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(walls.command_s)),
         ),
         ("weights sha256", s.weights_sha256),
-    ];
+    ]);
     let out = job.folder.display();
+    let episodes = s.final_episodes;
     output.say(format!("\nDone: {why}. On {episodes} episodes with starts that training never saw:\n"));
-    let crashes = job.config.task.name == TaskName::Drones;
-    for (name, value) in rows.into_iter().filter(|(name, _)| crashes || *name != "collision rate") {
+    for (name, value) in rows {
         output.say(format!("  {name:<16} {value}"));
     }
     let magex = program();

@@ -1,6 +1,7 @@
 //! Bodies that meet, fall and are in the way: what rapier does with them, and what counts as a crash.
 
 use super::*;
+use magex_core::metrics_table::{COLLISION_RATE, REWARD};
 
 /// No gravity, no damping, no effects: what is left is rapier.
 fn vacuum(dt: f64) -> Laws {
@@ -151,7 +152,7 @@ fn a_drone_that_falls_crashes_on_the_ground_and_stays_there() {
     assert!((seen.positions[2] - 0.0125).abs() < 2e-3 && seen.velocities[2] == 0.0, "{seen:?}");
     assert_eq!(crash(&drones, 1), None);
     let score = drones.scores()[0];
-    assert_eq!(score.collision_rate, 0.5);
+    assert_eq!(score[COLLISION_RATE], 0.5);
 }
 
 #[test]
@@ -204,5 +205,5 @@ fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
     }
     assert_eq!(crash(&drones, 0), Some(Crash::NotFinite));
     assert_eq!((crash(&drones, 1), crash(&drones, 2)), (None, None));
-    assert!(drones.scores()[0].reward.is_finite());
+    assert!(drones.scores()[0][REWARD].is_finite());
 }

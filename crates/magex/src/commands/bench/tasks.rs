@@ -6,6 +6,7 @@ use crate::failure::usage;
 use crate::output::{note, seconds, share, thousands};
 use crate::settings::named;
 use magex_core::config::ExecutorKind;
+use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -75,42 +76,17 @@ const TASKS: [(&str, &[Variant]); 4] = [
     ),
 ];
 
-/// Numbers of an evaluation that are shown, in this order.
-const SHOWN: [&str; 9] = [
-    "success_rate",
-    "matched_success_rate",
-    "all_covered_rate",
-    "spawn_success_rate",
-    "arrival_step",
-    "collisions_per_agent_step",
-    "collision_rate",
-    "cost_ratio",
-    "second_cost_ratio",
-];
-
 pub(super) fn tasks(args: &TasksArgs) -> anyhow::Result<Report> {
     let place = args.keep.place()?;
     let title = format!(
         "Training with services and two actor processes, then {} unseen greedy episodes per seed; seeds {:?}",
         args.episodes, args.seeds
     );
-    let heading = [
-        "task",
-        "executor",
-        "measured on",
-        "joint steps",
-        "wall",
-        "success",
-        "worst seed",
-        "matched",
-        "all",
-        "at spawn",
-        "arrival",
-        "collisions",
-        "crashed",
-        "cost",
-        "second",
-    ];
+    let shown = || METRICS.iter().filter(|metric| metric.greedy());
+    let heading: Vec<&str> = ["task", "executor", "measured on", "joint steps", "wall", "worst seed"]
+        .into_iter()
+        .chain(shown().map(|metric| metric.show.label))
+        .collect();
     let mut report = Report::new("tasks", title, 3, &heading);
     for task in &args.tasks {
         let variants = TASKS.iter().find(|(name, _)| name == task).map(|(_, variants)| *variants);
@@ -152,26 +128,21 @@ pub(super) fn tasks(args: &TasksArgs) -> anyhow::Result<Report> {
                 let average = |key: &str| {
                     evaluations.iter().map(|e| greedy(e, key)).sum::<f64>() / evaluations.len().max(1) as f64
                 };
-                let [success, matched, all, spawn, arrival, collisions, crashed, cost, second] = SHOWN.map(average);
-                let lowest = evaluations.iter().map(|e| greedy(e, SHOWN[0])).fold(f64::INFINITY, f64::min);
-                (mean, weight) = (mean + part * success, weight + part);
-                let cells = vec![
+                let success = METRICS[SUCCESS_RATE].name;
+                let lowest = evaluations.iter().map(|e| greedy(e, success)).fold(f64::INFINITY, f64::min);
+                (mean, weight) = (mean + part * average(success), weight + part);
+                let mut cells = vec![
                     task.clone(),
                     executor.to_string(),
                     name.to_owned(),
                     thousands(steps),
                     seconds(wall),
-                    share(success),
                     share(lowest),
-                    share(matched),
-                    share(all),
-                    share(spawn),
-                    format!("{arrival:.1}"),
-                    format!("{collisions:.4}"),
-                    format!("{crashed:.4}"),
-                    format!("{cost:.4}"),
-                    if second.is_nan() { String::new() } else { format!("{second:.4}") },
                 ];
+                cells.extend(shown().map(|metric| match average(metric.name) {
+                    absent if absent.is_nan() => String::new(),
+                    value => metric.write(value),
+                }));
                 report.row(
                     cells,
                     json!({

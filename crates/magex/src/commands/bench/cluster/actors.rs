@@ -4,6 +4,7 @@ use super::ingest::weights;
 use anyhow::{Context as _, bail};
 use bytes::Bytes;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::METRICS;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
@@ -77,17 +78,8 @@ fn trajectory(task: &TaskConfig, shard: &Shard) -> Trajectory {
     let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
     let mut stream = Key::new(0, Purpose::Action, &[shard.index]).stream();
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| stream.uniform32()).collect() };
-    let metrics = EpisodeMetrics {
-        success: 1.0,
-        matched_success: 1.0,
-        spawn_success: 0.0,
-        arrival_step: 1,
-        collisions_per_agent_step: 0.0,
-        collision_rate: 0.0,
-        reward: 0.0,
-        cost_ratio: 1.0,
-        second_cost_ratio: None,
-    };
+    // A value that every metric may have.
+    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
     Trajectory {
         shard: *shard,
         shape,

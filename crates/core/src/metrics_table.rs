@@ -1,0 +1,319 @@
+//! The metrics of an episode, one row each: name, meaning, range and where it is displayed.
+//!
+//! Every consumer loops over [`METRICS`]: environments, the wire, validation, metrics.jsonl, summary.json, plots, pages and
+//! tables. A new metric is a row here, the code that computes it, and a row in docs/metrics.md.
+
+use crate::task::{TaskConfig, TaskName};
+
+/// A row of the table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Metric {
+    /// Its name on the wire, in files and in TensorBoard.
+    pub name: &'static str,
+    /// What the unit counts. Over several episodes every metric is their mean.
+    pub help: &'static str,
+    /// Unit of the value.
+    pub unit: &'static str,
+    /// Smallest and largest value that the learner accepts; every value is finite.
+    pub range: [f32; 2],
+    /// Which tasks have it.
+    pub scope: Scope,
+    /// Its column over an iteration's training episodes (sampled actions), if metrics.jsonl has one. If that column has the
+    /// metric's own name, metrics.jsonl does not have the one of the greedy evaluation.
+    pub sampled: Option<&'static str>,
+    /// Where and how it is displayed.
+    pub show: Show,
+}
+
+/// Which tasks have a metric. A task without it leaves it absent (NaN in an episode, null in JSON) or writes a constant, and
+/// tables and plots leave it out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scope {
+    /// All.
+    EveryTask,
+    /// Tasks whose agents can crash.
+    Crashes,
+    /// Tasks with a second assignment stage.
+    SecondStage,
+}
+
+/// Where and how a metric is displayed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Show {
+    /// Heading of its column or plot.
+    pub label: &'static str,
+    /// How a value is written.
+    pub format: Format,
+    /// Whether `magex train` has a column for it. (`magex eval` has one for every metric of the task.)
+    pub progress: bool,
+    /// Vertical axis of its plot in curve.svg and on the live page, if it has one.
+    pub plot: Option<Scale>,
+    /// Whether a replay lists it beside the episode. (A replay computes arrival and collisions from the states.)
+    pub replay: bool,
+}
+
+/// How a value is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// See [`share`].
+    Share,
+    /// Digits after the point.
+    Decimals(usize),
+}
+
+/// How the vertical axis of a plot is chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scale {
+    /// 0 to 1.
+    Share,
+    /// 0 to a little above the largest value.
+    FromZero,
+    /// 1 (or the smallest value, if that is less) to a little above the largest value.
+    FromOne,
+    /// The smallest to the largest value.
+    Free,
+}
+
+/// Every metric of an episode, in the order of the wire and of metrics.jsonl.
+pub const METRICS: &[Metric] = &[
+    Metric {
+        name: "success_rate",
+        help: "covered at the last step: by an agent within 0.15, by a ball within 0.30 (Push Ball), by a drone within 0.15 \
+               that has not crashed",
+        unit: "share of landmarks",
+        range: [0.0, 1.0],
+        scope: Scope::EveryTask,
+        sampled: Some("sampled_success_rate"),
+        show: Show { label: "success", format: Format::Share, progress: true, plot: Some(Scale::Share), replay: true },
+    },
+    Metric {
+        name: "matched_success_rate",
+        help: "matched one-to-one to what covers them at the last step; Push Ball: covered by their own ball",
+        unit: "share of landmarks",
+        range: [0.0, 1.0],
+        scope: Scope::EveryTask,
+        sampled: None,
+        show: Show { label: "matched", format: Format::Share, progress: false, plot: None, replay: true },
+    },
+    Metric {
+        name: "all_covered_rate",
+        help: "1 if every landmark is covered at the last step, otherwise 0",
+        unit: "share of episodes",
+        range: [0.0, 1.0],
+        scope: Scope::EveryTask,
+        sampled: None,
+        show: Show { label: "all covered", format: Format::Share, progress: false, plot: None, replay: false },
+    },
+    Metric {
+        name: "arrival_step",
+        help: "first step after which at least 99 % of the landmarks were covered; the horizon + 1 if that never happened",
+        unit: "steps",
+        range: [1.0, f32::MAX],
+        scope: Scope::EveryTask,
+        sampled: None,
+        show: Show {
+            label: "arrival",
+            format: Format::Decimals(1),
+            progress: true,
+            plot: Some(Scale::FromZero),
+            replay: false,
+        },
+    },
+    Metric {
+        name: "collisions_per_agent_step",
+        help: "other agents closer than two radii; drones: agents that crashed",
+        unit: "per agent and step",
+        range: [0.0, f32::MAX],
+        scope: Scope::EveryTask,
+        sampled: Some("sampled_collisions_per_agent_step"),
+        show: Show {
+            label: "collisions",
+            format: Format::Decimals(4),
+            progress: true,
+            plot: Some(Scale::FromZero),
+            replay: false,
+        },
+    },
+    Metric {
+        name: "collision_rate",
+        help: "crashed; 0 in tasks where nothing crashes",
+        unit: "share of agents",
+        range: [0.0, 1.0],
+        scope: Scope::Crashes,
+        sampled: Some("sampled_collision_rate"),
+        show: Show {
+            label: "crashed",
+            format: Format::Decimals(4),
+            progress: true,
+            plot: Some(Scale::FromZero),
+            replay: true,
+        },
+    },
+    Metric {
+        name: "spawn_success_rate",
+        help: "covered before the first step",
+        unit: "share of landmarks",
+        range: [0.0, 1.0],
+        scope: Scope::EveryTask,
+        sampled: None,
+        show: Show { label: "at spawn", format: Format::Share, progress: false, plot: None, replay: true },
+    },
+    Metric {
+        name: "cost_ratio",
+        help: "C_c / C_h, at the start of the episode: summed distance of the commander's assignment over that of the exact \
+               one, from agents to their (first) goals",
+        unit: "ratio",
+        range: [0.0, f32::MAX],
+        scope: Scope::EveryTask,
+        sampled: Some("sampled_cost_ratio"),
+        show: Show {
+            label: "cost",
+            format: Format::Decimals(4),
+            progress: true,
+            plot: Some(Scale::FromOne),
+            replay: true,
+        },
+    },
+    Metric {
+        name: "second_cost_ratio",
+        help: "C_c / C_h of the second stage, from balls to landmarks; null in tasks with one assignment",
+        unit: "ratio",
+        range: [0.0, f32::MAX],
+        scope: Scope::SecondStage,
+        sampled: None,
+        show: Show {
+            label: "second cost",
+            format: Format::Decimals(4),
+            progress: true,
+            plot: Some(Scale::FromOne),
+            replay: true,
+        },
+    },
+    Metric {
+        name: "reward",
+        help: "mean reward",
+        unit: "per agent and step",
+        range: [f32::MIN, f32::MAX],
+        scope: Scope::EveryTask,
+        sampled: Some("reward"),
+        show: Show {
+            label: "reward",
+            format: Format::Decimals(3),
+            progress: false,
+            plot: Some(Scale::Free),
+            replay: true,
+        },
+    },
+];
+
+/// Row of the metric that decides when a run stops.
+pub const SUCCESS_RATE: usize = row("success_rate");
+/// Row of the one-to-one matched share.
+pub const MATCHED_SUCCESS_RATE: usize = row("matched_success_rate");
+/// Row of the share of completely covered episodes.
+pub const ALL_COVERED_RATE: usize = row("all_covered_rate");
+/// Row of the arrival step.
+pub const ARRIVAL_STEP: usize = row("arrival_step");
+/// Row of the contacts.
+pub const COLLISIONS_PER_AGENT_STEP: usize = row("collisions_per_agent_step");
+/// Row of the crashed share.
+pub const COLLISION_RATE: usize = row("collision_rate");
+/// Row of the share that the spawn covers.
+pub const SPAWN_SUCCESS_RATE: usize = row("spawn_success_rate");
+/// Row of the first stage's cost ratio.
+pub const COST_RATIO: usize = row("cost_ratio");
+/// Row of the second stage's cost ratio.
+pub const SECOND_COST_RATIO: usize = row("second_cost_ratio");
+/// Row of the reward.
+pub const REWARD: usize = row("reward");
+
+/// Row of a name; a name without a row does not compile.
+const fn row(name: &str) -> usize {
+    let mut row = 0;
+    while !same(METRICS[row].name.as_bytes(), name.as_bytes()) {
+        row += 1;
+    }
+    row
+}
+
+/// `==` of slices is not const yet.
+const fn same(a: &[u8], b: &[u8]) -> bool {
+    let mut at = 0;
+    while at < a.len() && at < b.len() && a[at] == b[at] {
+        at += 1;
+    }
+    at == a.len() && at == b.len()
+}
+
+impl Metric {
+    /// Whether a task has it.
+    pub fn applies(&self, task: &TaskConfig) -> bool {
+        match self.scope {
+            Scope::EveryTask => true,
+            Scope::Crashes => task.name == TaskName::Drones,
+            Scope::SecondStage => task.stages().len() > 1,
+        }
+    }
+
+    /// Whether metrics.jsonl and summary.json have it of the greedy evaluation.
+    pub fn greedy(&self) -> bool {
+        self.sampled != Some(self.name)
+    }
+
+    /// A value as tables show it.
+    pub fn write(&self, value: f64) -> String {
+        match self.show.format {
+            Format::Share => share(value),
+            Format::Decimals(digits) => format!("{value:.digits$}"),
+        }
+    }
+}
+
+/// A share between 0 and 1: four decimals, and never rounded up to 1.
+pub fn share(value: f64) -> String {
+    if value < 1.0 { format!("{:.4}", value.min(0.9999)) } else { format!("{value:.4}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn columns_of_metrics_jsonl_have_different_names() {
+        let greedy = METRICS.iter().filter(|metric| metric.greedy()).map(|metric| metric.name);
+        let columns: Vec<&str> = greedy.chain(METRICS.iter().filter_map(|metric| metric.sampled)).collect();
+        assert_eq!(columns.iter().collect::<BTreeSet<_>>().len(), columns.len(), "{columns:?}");
+        assert_eq!(METRICS[SECOND_COST_RATIO].name, "second_cost_ratio");
+        assert!(METRICS.iter().all(|metric| metric.range[0] <= 1.0 && 1.0 <= metric.range[1]), "fixtures are 1");
+    }
+
+    #[test]
+    fn the_documentation_has_a_row_for_every_metric() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/metrics.md");
+        let text = std::fs::read_to_string(path).unwrap();
+        let section = text.split("\n## ").find(|section| section.starts_with("Metrics of an episode")).unwrap();
+        let table: Vec<&str> = section.lines().filter(|line| line.starts_with("| `")).collect();
+        let expected: Vec<String> = METRICS
+            .iter()
+            .map(|metric| {
+                let greedy = if metric.greedy() { "yes" } else { "no" };
+                let sampled = metric.sampled.map_or("no".to_owned(), |name| format!("`{name}`"));
+                format!("| `{}` | {} | {} | {greedy} | {sampled} |", metric.name, metric.unit, metric.help)
+            })
+            .collect();
+        assert_eq!(table, expected, "docs/metrics.md must have these rows:\n{}", expected.join("\n"));
+    }
+
+    #[test]
+    fn tasks_have_the_metrics_of_their_scope() {
+        use crate::task::Spawn;
+        let without = |name| {
+            let task = TaskConfig::of(name, 5, Spawn::Uniform);
+            METRICS.iter().filter(|m| !m.applies(&task)).map(|m| m.name).collect::<Vec<_>>()
+        };
+        assert_eq!(without(TaskName::SimpleSpread), ["collision_rate", "second_cost_ratio"]);
+        assert_eq!(without(TaskName::PushBall), ["collision_rate"]);
+        assert_eq!(without(TaskName::Drones), ["second_cost_ratio"]);
+    }
+}
