@@ -12,7 +12,7 @@ fn undisturbed(config: &RunConfig) -> String {
     train(config, tempfile::tempdir().unwrap().path(), 1, 1).sha256
 }
 
-/// So many that the run is seldom over before the last round.
+/// Enough that a fast machine is not at the end of the run before [`LEAST_ROUNDS`].
 const ITERATIONS: u64 = 600;
 
 /// What may happen in a round.
@@ -137,7 +137,7 @@ fn stranded_connections_are_given_up_by_both_sides_and_made_anew() {
     cluster.start_actor();
     cluster.start_actor();
     cluster.wait_for_iteration(4);
-    // Nobody is told. The pings of both ends find out; nothing but them speaks on the streams of weights.
+    // No end is notified. The pings of both ends detect it; the streams of weights carry nothing else.
     let before: usize = cluster.wires().all().iter().map(|wire| wire.accepted()).sum();
     cluster.wires().all().iter().for_each(|wire| wire.strand());
     assert_eq!(cluster.finish(), undisturbed(&config));
