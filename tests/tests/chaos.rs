@@ -13,7 +13,9 @@ fn undisturbed(config: &RunConfig) -> String {
 }
 
 /// Enough that a fast machine is not at the end of the run before [`LEAST_ROUNDS`].
-const ITERATIONS: u64 = 600;
+const ITERATIONS: u64 = 1500;
+/// Rounds of events that a run must have seen.
+const LEAST_ROUNDS: usize = 8;
 
 /// What may happen in a round.
 #[derive(Debug, Clone, Copy)]
@@ -81,6 +83,11 @@ fn whatever_happens_in_whatever_order_the_bits_are_the_same() {
         }
         println!("seed {seed}: {} rounds, then iteration {} of {ITERATIONS}", told.len(), cluster.iterations());
         assert_eq!(cluster.finish(), expected, "seed {seed}: {told:?}");
+        assert!(
+            told.len() >= LEAST_ROUNDS,
+            "seed {seed}: the run was over after {} rounds; raise ITERATIONS",
+            told.len()
+        );
     }
 }
 

@@ -4,7 +4,7 @@
 use crate::clients::team;
 use crate::floods::{healthy, post};
 use crate::sandbox::*;
-use crate::security::{commander_as, all_roles, guarded};
+use crate::security::{all_roles, commander_as, guarded};
 use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest, WeightsKey};
 use magex_commander::service::CommanderConfig;
 use magex_commander::weights_file::WeightsFile;

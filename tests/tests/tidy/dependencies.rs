@@ -53,12 +53,17 @@ fn dependencies_point_down_only() {
         assert!(!reach(&metadata, name).contains(bad), "{name} must not link {bad}");
     }
     for package in metadata.workspace_packages() {
-        let direct = |bad: &&str| package.dependencies.iter().any(|d| d.name == *bad && d.kind == DependencyKind::Normal);
+        let direct =
+            |bad: &&str| package.dependencies.iter().any(|d| d.name == *bad && d.kind == DependencyKind::Normal);
         if package.name.as_str() == "magex-dispatch" {
             assert_eq!(["tokio", "tonic", "tokio-util"].iter().find(|bad| direct(bad)), None, "{}", package.name);
         }
         let may_load = ["magex-bench", "magex-tests"].contains(&package.name.as_str());
-        assert!(may_load || !direct(&"magex-bench"), "{} is product and must not link the load generators", package.name);
+        assert!(
+            may_load || !direct(&"magex-bench"),
+            "{} is product and must not link the load generators",
+            package.name
+        );
     }
 }
 
@@ -84,7 +89,8 @@ fn every_declared_dependency_is_used() {
         for dependency in &package.dependencies {
             let name = dependency.rename.as_ref().unwrap_or(&dependency.name).replace('-', "_");
             let seen = if dependency.kind == DependencyKind::Normal { &product } else { &all };
-            let excused = |(at, what, _): &&(&str, &str, &str)| *at == package.name.as_str() && *what == dependency.name;
+            let excused =
+                |(at, what, _): &&(&str, &str, &str)| *at == package.name.as_str() && *what == dependency.name;
             if !seen.contains(&name) && !USED_WITHOUT_A_NAME.iter().any(|entry| excused(&entry)) {
                 unused.push(format!("{} ({}): {}", package.name, dependency.kind, dependency.name));
             }

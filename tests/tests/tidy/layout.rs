@@ -44,7 +44,11 @@ fn files_stay_readable_and_mains_stay_short() {
         .collect();
     for path in files(&[".rs"]) {
         let in_source = path.components().any(|part| part.as_os_str() == "src");
-        assert!(!in_source || known.contains(&root().join(&path)) || path.starts_with("scratch_tidy"), "{}: no module declares it", path.display());
+        assert!(
+            !in_source || known.contains(&root().join(&path)) || path.starts_with("scratch_tidy"),
+            "{}: no module declares it",
+            path.display()
+        );
     }
 }
 
@@ -75,7 +79,9 @@ fn module_cycles() {
     for package in metadata.workspace_packages() {
         for group in targets(package).iter().flat_map(cycles) {
             let group: Vec<String> = group.into_iter().collect();
-            let allowed = ALLOWED_CYCLES.iter().find(|(at, one, _)| *at == package.name.as_str() && group.contains(&(*one).to_owned()));
+            let allowed = ALLOWED_CYCLES
+                .iter()
+                .find(|(at, one, _)| *at == package.name.as_str() && group.contains(&(*one).to_owned()));
             let reason = allowed.map_or("not allowed", |(_, _, reason)| *reason);
             println!("{}: {} modules, {reason}: {}", package.name, group.len(), group.join(", "));
             count += 1;
