@@ -1,4 +1,4 @@
-//! What is fed with bytes that nobody vouches for: requests, trajectories, weights, checkpoints, records of missions.
+//! Decoders that are fed untrusted bytes: requests, trajectories, weights, checkpoints, records of missions.
 //!
 //! Every target takes any bytes and panics where a promise breaks; that it returns at all is part of the promise. The
 //! tests run them on damaged copies of good examples, `fuzz/` on what a coverage-guided fuzzer finds.

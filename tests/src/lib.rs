@@ -46,6 +46,8 @@ pub struct Ran {
     pub outcome: Outcome,
     /// Hash of actor, critic and commander.
     pub sha256: String,
+    /// Hash of the goal commander alone.
+    pub commander_sha256: String,
     /// Events in order.
     pub events: Vec<RunEvent>,
 }
@@ -62,8 +64,10 @@ pub fn drive(mut trainer: Trainer, config: &RunConfig, actors: usize, stop: &Arc
     let mut collector = LocalCollector::new(config, actors, sender, stop.clone());
     let outcome = trainer.run(&mut collector).expect("training");
     drop(collector);
-    let weights = trainer.learned().weights().expect("weights");
-    Ran { outcome, sha256: magex_learner::checkpoint::sha256_hex(&weights), events: receiver.iter().collect() }
+    let learned = trainer.learned();
+    let sha256 = magex_learner::checkpoint::sha256_hex(&learned.weights().expect("weights"));
+    let commander_sha256 = learned.commander.params.sha256();
+    Ran { outcome, sha256, commander_sha256, events: receiver.iter().collect() }
 }
 
 /// The `executor` part of every metrics line.

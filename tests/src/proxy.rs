@@ -20,9 +20,9 @@ pub struct Faults {
     pub bytes_per_second: Option<u64>,
     /// Half-open: connections are taken and kept, and nothing comes through.
     pub mute: bool,
-    /// One bit flips in about so many bytes.
+    /// One bit is flipped per this number of bytes, on average.
     pub corrupt_every: Option<u64>,
-    /// One byte is lost in about so many bytes.
+    /// One byte is lost per this number of bytes, on average.
     pub drop_every: Option<u64>,
 }
 

@@ -1,5 +1,5 @@
-//! A man in the middle who understands the protocol: between actors and a learner he repeats, reorders and damages what is
-//! said, as a seed has it.
+//! A relay that understands the protocol: between actors and a learner it repeats, reorders and damages messages, in an order
+//! that a seed decides.
 
 use bytes::Bytes;
 use magex_core::rng::{Key, Purpose, Stream};

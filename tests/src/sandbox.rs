@@ -387,7 +387,7 @@ impl Cluster {
     }
 }
 
-/// An address that nobody listens on for now.
+/// A free address of this machine: no process listens on it for now.
 fn free_address() -> String {
     let socket = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
     socket.local_addr().expect("its address").to_string()

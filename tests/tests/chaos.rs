@@ -12,8 +12,10 @@ fn undisturbed(config: &RunConfig) -> String {
     train(config, tempfile::tempdir().unwrap().path(), 1, 1).sha256
 }
 
-/// So many that the run is seldom over before the last round.
-const ITERATIONS: u64 = 600;
+/// Enough that a fast machine is not at the end of the run before [`LEAST_ROUNDS`].
+const ITERATIONS: u64 = 1500;
+/// Rounds of events that a run must have seen.
+const LEAST_ROUNDS: usize = 8;
 
 /// What may happen in a round.
 #[derive(Debug, Clone, Copy)]
@@ -81,6 +83,11 @@ fn whatever_happens_in_whatever_order_the_bits_are_the_same() {
         }
         println!("seed {seed}: {} rounds, then iteration {} of {ITERATIONS}", told.len(), cluster.iterations());
         assert_eq!(cluster.finish(), expected, "seed {seed}: {told:?}");
+        assert!(
+            told.len() >= LEAST_ROUNDS,
+            "seed {seed}: the run was over after {} rounds; raise ITERATIONS",
+            told.len()
+        );
     }
 }
 
@@ -137,7 +144,7 @@ fn stranded_connections_are_given_up_by_both_sides_and_made_anew() {
     cluster.start_actor();
     cluster.start_actor();
     cluster.wait_for_iteration(4);
-    // Nobody is told. The pings of both ends find out; nothing but them speaks on the streams of weights.
+    // No end is notified. The pings of both ends detect it; the streams of weights carry nothing else.
     let before: usize = cluster.wires().all().iter().map(|wire| wire.accepted()).sum();
     cluster.wires().all().iter().for_each(|wire| wire.strand());
     assert_eq!(cluster.finish(), undisturbed(&config));

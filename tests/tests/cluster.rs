@@ -150,7 +150,7 @@ fn an_actor_for_another_task_is_refused_with_both_sides_named() {
     let log = actor.log();
     assert!(log.contains(&other.task.fingerprint()), "{log}");
     assert!(log.contains(&small(ExecutorKind::Local, 5, 3).task.fingerprint()), "{log}");
-    // Nobody else is disturbed.
+    // The other processes are not disturbed.
     cluster.start_actor();
     cluster.finish();
 }

@@ -53,7 +53,7 @@ impl Project {
         println!("{}", image.trim());
         let settings = vec![
             ("MAGEX_IMAGE", name.clone()),
-            // Any free port of this machine: nobody is disturbed.
+            // Any free port of this machine.
             ("MAGEX_PUBLISH_COMMANDER", String::new()),
             ("MAGEX_PUBLISH_PAGE", String::new()),
             ("MAGEX_LEASE_SECONDS", "5".to_owned()),
@@ -261,7 +261,7 @@ const SHORT: &str = "[run]\nmax_steps = 1600\neval_episodes = 4\nfinal_episodes 
 
 #[test]
 #[ignore = "needs a Docker engine; .ci/run runs it where there is one"]
-fn with_certificates_the_cluster_lets_in_who_is_known() {
+fn with_certificates_the_cluster_accepts_known_clients_only() {
     let mut project = Project::new("tls", &["compose.yaml", "compose.tls.yaml"]);
     let certificates = project.folder.path().join("certificates");
     done(Command::new(root().join("deploy/certificates")).arg(&certificates));
@@ -291,8 +291,8 @@ fn with_certificates_the_cluster_lets_in_who_is_known() {
     assert!(known.status.success(), "{}", text(&known.stderr));
     let strangers =
         [(true, None, "no token"), (true, Some("guess"), "a wrong token"), (false, Some(&*token), "no certificate")];
-    for (certificate, token, who) in strangers {
-        assert!(!assign(certificate, token).status.success(), "{who}");
+    for (certificate, token, missing) in strangers {
+        assert!(!assign(certificate, token).status.success(), "{missing}");
     }
     let plain = Command::new(binary()).args(["health", &format!("http://localhost:{port}")]).output().unwrap();
     assert_eq!(plain.status.code(), Some(1), "nothing is answered without encryption");

@@ -1,4 +1,4 @@
-//! Bytes that nobody vouches for: a fixed number of damaged copies of good examples through everything that decodes.
+//! Untrusted bytes: a fixed number of damaged copies of good examples goes through every decoder.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_commander::service::CommanderConfig;
@@ -21,7 +21,7 @@ use tonic::codegen::http::uri::PathAndQuery;
 use tonic::{Code, Request};
 use tonic_types::StatusExt as _;
 
-/// Runs a target on examples and on so many damaged copies. `MAGEX_SEEDS` names a folder that the examples are written to: seeds
+/// Runs a target on examples and on `count` damaged copies. `MAGEX_SEEDS` names a folder that the examples are written to: seeds
 /// for fuzz/run.
 fn run(name: &str, examples: Vec<Vec<u8>>, count: usize, target: impl Fn(&[u8])) {
     for (k, example) in examples.iter().enumerate() {

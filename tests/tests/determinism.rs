@@ -163,6 +163,7 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
             assert!((ratio - 1.0).abs() < 1e-6);
         }
         assert_eq!(before.params.numbers.is_empty(), !kind.learned(), "{kind}");
+        assert_eq!(before.params.sha256() != ran.commander_sha256, kind.learned(), "{kind}: what training changed");
     }
 }
 

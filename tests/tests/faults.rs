@@ -85,7 +85,7 @@ fn a_stopped_and_a_mute_actor_are_evicted_within_a_lease() {
     let took = start.elapsed();
     assert!(took <= Duration::from_secs(3), "a lease of 2 s and one more: {took:?}");
     assert_eq!(cluster.learner.log().matches("fell silent").count(), 2, "{}", cluster.learner.log());
-    // The work goes on with whoever comes, and with those who come back.
+    // The work goes on with an actor that is new, and with the two that come back.
     let reached = cluster.status().unwrap().iteration;
     cluster.start_actor();
     cluster.wait_for_iteration(reached + 3);
@@ -126,7 +126,11 @@ impl SmallDisk {
         if mounted.is_ok_and(|status| status.success()) {
             return Some(Self { folder });
         }
-        eprintln!("NOT TESTED: a full disk; this user cannot mount a small one");
+        assert!(
+            std::env::var_os("MAGEX_CI_MOUNT").is_none(),
+            "a small file system cannot be mounted, and must be here"
+        );
+        eprintln!("NOT CHECKED: a full disk; this user cannot mount a small file system");
         None
     }
 
@@ -343,7 +347,7 @@ fn stop(process: &mut Process, code: i32) {
 }
 
 #[test]
-fn everybody_stops_within_ten_seconds_whoever_hangs_on() {
+fn every_process_stops_within_ten_seconds_with_peers_that_do_not_answer() {
     let config = long();
     let mut cluster = Cluster::start(&config);
     cluster.start_actor();

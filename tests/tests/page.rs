@@ -45,7 +45,7 @@ fn start(arguments: &[&str], log: &Path) -> (Running, Value) {
         .spawn()
         .unwrap();
     let mut line = String::new();
-    // The actor is ready only when it has found its learner: nobody waits for its line.
+    // The actor is ready only when it has found its learner: the test does not wait for its line.
     if arguments[0] != "actor" {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     }
@@ -58,7 +58,7 @@ fn request(address: &str, text: &str) -> String {
     let mut socket = TcpStream::connect(address).unwrap();
     socket.set_read_timeout(Some(PATIENCE)).unwrap();
     socket.write_all(text.as_bytes()).unwrap();
-    // By its length: not everybody closes a connection that was to be closed.
+    // By its length: a server may leave a connection open although it was asked to close it.
     let mut reader = BufReader::new(socket);
     let (mut answer, mut length) = (String::new(), 0);
     while !answer.ends_with("\r\n\r\n") {
@@ -246,7 +246,7 @@ async fn the_page_shows_a_run_across_a_restart_of_its_learner() {
     let noise: Vec<_> = browser.log().await.into_iter().filter(|line| !line.contains("net::ERR_")).collect();
     assert_eq!(noise, [""; 0], "the console");
 
-    // Whoever comes now sees the curves from the start; a wrong path leads nowhere.
+    // A viewer that comes now sees the curves from the start; a wrong path is not found.
     browser.client.refresh().await.unwrap();
     browser
         .until("all points", &format!("Number(document.getElementById('curve-success').dataset.points) > {before}"))

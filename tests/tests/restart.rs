@@ -133,7 +133,7 @@ fn one_command_begins_continues_and_serves_a_run() {
     assert_eq!(learner.wait().code(), Some(0), "a complete run that is told to stop is done");
     stays.signal("TERM");
     assert!(stays.wait().success());
-    // Whoever continues a complete run finds it as it was.
+    // A resume of a complete run leaves it as it was.
     let resumed = magex(&format!("train --resume --out {} --in-process --json", policy.run().display()));
     assert!(resumed.status.success(), "{}", String::from_utf8_lossy(&resumed.stderr));
     let pictures = |name: &Path| name.extension().is_some_and(|e| e == "svg" || e == "html");

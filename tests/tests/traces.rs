@@ -86,13 +86,13 @@ fn one_trace_goes_from_the_lease_to_the_update_through_every_process() {
     wait_until("a trace over all processes", || collector.has_whole_trace());
     // The closing one, too, whose span is the last thing that ends.
     wait_until("every iteration", || collector.iterations() == 7);
-    // Nobody's log shows the spans.
+    // No log shows the spans.
     assert!(!cluster.learner.log().contains("magex_trace"), "{}", cluster.learner.log());
     assert_eq!(sha256, train(&config, tempfile::tempdir().unwrap().path(), 1, 1).sha256);
 }
 
 #[test]
-fn a_collector_that_is_not_there_stops_nobody() {
+fn a_collector_that_is_not_there_stops_no_process() {
     let config = small(ExecutorKind::Local, 5, 6);
     let mut cluster = Cluster::start_with(&config, options(&["--otlp", "http://127.0.0.1:9"]));
     cluster.start_actor();

@@ -80,7 +80,7 @@ fn check_mission(mission: &Mission) {
 fn check_refusal(error: &DispatchError) {
     match error {
         DispatchError::Invalid(error) => assert!(!error.field.is_empty() && !error.problem.is_empty()),
-        DispatchError::Interrupted => panic!("nobody interrupted it"),
+        DispatchError::Interrupted => panic!("it was not interrupted"),
     }
 }
 

@@ -1,4 +1,4 @@
-//! What the learner does when there is too much of something, or somebody never listens.
+//! What the learner does when there is too much of something, or a peer never reads.
 
 use crate::sandbox::*;
 use bytes::Bytes;
@@ -29,7 +29,7 @@ async fn fifty_actors_at_two_places_are_all_answered_at_once() {
             let hello = v1::Hello { incarnation, ..Puppet::hello() };
             let mut puppet = Puppet::connect(&url, hello).await.unwrap();
             let answer = puppet.next().await;
-            // Those who are in stay until everybody has been answered.
+            // Accepted actors stay until all have been answered.
             (puppet, answer)
         });
     }
@@ -80,7 +80,7 @@ async fn a_watcher_that_reads_nothing_loses_its_place_and_its_stream() {
     let mut deaf = stalled.watch_weights(v1::WatchWeightsRequest::default()).await.unwrap().into_inner();
     let mut client = learner_client(&learner.url).await;
     let mut events = client.watch_run(v1::WatchRunRequest {}).await.unwrap().into_inner();
-    // Both places are taken; whoever comes now is told so, and when to come again.
+    // Both places are taken: the next call is rejected with a retry delay.
     let full = client.watch_weights(v1::WatchWeightsRequest::default()).await.unwrap_err();
     assert_eq!(full.code(), Code::ResourceExhausted);
     assert!(full.get_details_retry_info().is_some());
@@ -126,7 +126,7 @@ impl Worker for Flaky {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_actor_whose_results_are_garbage_now_and_then_is_sent_away_and_nothing_of_it_is_trained_on() {
+async fn an_actor_whose_results_are_garbage_now_and_then_is_evicted_and_nothing_of_it_is_trained_on() {
     let mut learner = Learner::start().await;
     let worked = Arc::new(AtomicU32::new(0));
     let counter = worked.clone();
@@ -147,7 +147,7 @@ async fn an_actor_whose_results_are_garbage_now_and_then_is_sent_away_and_nothin
     let error = bad.end().await.unwrap_err();
     assert!(matches!(&error, ActorError::SentAway { reason, .. } if reason.contains("NaN is not finite")), "{error}");
     assert_eq!(learner.ledger().rejected, 3);
-    // The rest is for somebody else.
+    // Another actor does the rest.
     let good = Actor::start(&learner.url, "good", FakeWorker::default());
     assert_eq!(learner.finish().await.unwrap(), expected(&plan(iteration, 8)));
     good.stop().await;
@@ -155,7 +155,7 @@ async fn an_actor_whose_results_are_garbage_now_and_then_is_sent_away_and_nothin
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_process_that_was_sent_away_is_not_let_in_again() {
+async fn an_evicted_process_is_not_accepted_again() {
     let mut learner = Learner::start().await;
     learner.collector.publish(&weights(0)).unwrap();
     learner.collector.open(plan(0, 1)).unwrap();

@@ -1,4 +1,4 @@
-//! Certificates: who trusts whom, and a whole cluster behind them.
+//! Certificates: which peers are trusted, and a whole cluster that uses them.
 
 use crate::clients::team;
 use crate::sandbox::*;
@@ -126,7 +126,7 @@ async fn a_cluster_trains_behind_certificates_and_tokens() {
     let actor = Actor::start_with(config_, FakeWorker { ask_goals: true, ..FakeWorker::default() });
     assert_eq!(learner.iterate(0, 4).await.unwrap(), expected(&plan(0, 4)));
 
-    // Who has no token, another's token, or trusts another authority does not get in.
+    // A client without a token, with another role's token, or that trusts another authority is rejected.
     let ask = async |settings: Settings| match settings.connect(&learner_url).await {
         Ok(channel) => code(LearnerServiceClient::new(channel).drain(v1::DrainRequest::default()).await),
         Err(_) => Some(Code::Unavailable),
@@ -143,7 +143,7 @@ async fn a_cluster_trains_behind_certificates_and_tokens() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_believes_a_certificate_that_is_over() {
+async fn an_expired_certificate_is_not_trusted() {
     let folder = tempfile::tempdir().unwrap();
     let authority = sign(folder.path(), "authority", None);
     let (good, over) =

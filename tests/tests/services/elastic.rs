@@ -134,7 +134,7 @@ fn always(_: &Shard) -> Result<(), WorkError> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_actor_that_can_do_nothing_is_sent_away_and_the_others_go_on() {
+async fn an_actor_that_can_do_nothing_is_evicted_and_the_others_go_on() {
     let mut learner = Learner::start().await;
     let gate = CancellationToken::new();
     let busy = FakeWorker { gate: Some(gate.clone()), ..FakeWorker::default() };
@@ -163,7 +163,7 @@ async fn a_run_that_none_of_its_actors_can_do_ends_with_the_reason() {
     let text = learner.iterate(0, 3).await.unwrap_err().to_string();
     assert!(text.contains("no instruction of this kind"), "{text}");
     let present = learner.handle.status().actors.len();
-    assert!(present >= 1, "the last one is not sent away");
+    assert!(present >= 1, "the last actor is not evicted");
     for actor in actors {
         actor.shutdown.cancel();
         let _ = actor.end().await;

@@ -42,7 +42,7 @@ fn address(url: &str) -> &str {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn idle_sockets_push_each_other_out_and_nobody_else() {
+async fn idle_sockets_evict_each_other_and_no_client_that_asks() {
     let commander = Commander::start_within(FEW, CommanderConfig::default()).await;
     let mut client = commander_client(&commander.url).await;
     client.assign(team()).await.unwrap();
@@ -173,7 +173,7 @@ async fn what_is_announced_counts_before_it_arrives() {
     assert_eq!(refused.code(), Code::ResourceExhausted, "{refused}");
     assert!(status::retry_delay(&refused).is_some());
     healthy(&commander.url).await;
-    // Who hangs up is forgotten.
+    // A connection that is closed no longer counts.
     drop((open, channel));
     let mut client = commander_client(&commander.url).await;
     within(async { while client.assign(team()).await.is_err() {} }).await;

@@ -1,4 +1,4 @@
-//! Who may work for a learner.
+//! Which actors a learner accepts.
 
 use crate::sandbox::*;
 use magex_actor::run::{ActorConfig, ActorError};

@@ -1,10 +1,10 @@
-//! Requests made to do harm: small on the wire and large in memory, unreadable, with shapes that nobody has; and callers who
-//! take what anybody may have.
+//! Malicious requests: small on the wire and large in memory, unreadable, with impossible shapes; and callers that take all
+//! anonymous connections.
 
 use crate::clients::team;
 use crate::floods::{healthy, post};
 use crate::sandbox::*;
-use crate::security::{commander_as, everybody, guarded};
+use crate::security::{all_roles, commander_as, guarded};
 use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest, WeightsKey};
 use magex_commander::service::CommanderConfig;
 use magex_commander::weights_file::WeightsFile;
@@ -110,7 +110,7 @@ async fn what_a_caller_made_long_comes_back_short() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn shards_that_nobody_has_are_refused() {
+async fn shards_that_do_not_exist_are_refused() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;
     let shard = plan(0, 1)[0];
@@ -142,10 +142,10 @@ async fn shards_that_nobody_has_are_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn strangers_who_call_make_way_for_those_who_are_known() {
+async fn unknown_callers_are_evicted_for_known_ones() {
     let folder = tempfile::tempdir().unwrap();
     let limits = ConnectionLimits { total: 3, per_peer: 3, first_call: Duration::from_secs(60) };
-    let config = CommanderConfig { security: guarded(everybody(folder.path())), ..CommanderConfig::default() };
+    let config = CommanderConfig { security: guarded(all_roles(folder.path())), ..CommanderConfig::default() };
     let commander = Commander::start_within(limits, config).await;
     let mut strangers = Vec::new();
     for _ in 0..3 {
@@ -159,7 +159,7 @@ async fn strangers_who_call_make_way_for_those_who_are_known() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_watches_the_health_too_often_is_refused_and_probes_are_answered() {
+async fn too_many_health_watches_are_refused_and_probes_are_answered() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = HealthClient::new(endpoint(&commander.url).unwrap().connect().await.unwrap());
     let mut open = Vec::new();

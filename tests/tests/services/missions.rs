@@ -1,4 +1,4 @@
-//! Missions over the wire: their life, who is told, what a restart leaves, and training episodes beside them.
+//! Missions over the wire: their life, their watchers, what a restart leaves, and training episodes beside them.
 
 use crate::sandbox::*;
 use magex_commander::service::CommanderConfig;
@@ -193,7 +193,7 @@ async fn updates_at_the_same_time_lose_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn training_episodes_are_missions_that_nobody_changes() {
+async fn training_episodes_are_missions_that_no_client_changes() {
     let mut learner = Learner::start().await;
     let commander = Commander::start("127.0.0.1:0", Some(&learner.url)).await;
     let mut client = commander_client(&commander.url).await;

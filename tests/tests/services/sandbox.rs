@@ -67,7 +67,7 @@ pub(crate) fn plan(iteration: u32, shards: u32) -> Vec<Shard> {
     (0..shards).map(shard).collect()
 }
 
-/// What a shard's result is, whoever computes it.
+/// The result of a shard: the same from every actor.
 pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> ShardResult {
     let (t, b, n) = (task.horizon as usize, shard.episodes as usize, task.agents);
     let shape = task.shape(b);
@@ -445,7 +445,7 @@ pub(crate) async fn commander_client(url: &str) -> CommanderServiceClient<Channe
     CommanderServiceClient::new(client::endpoint(url).unwrap().connect().await.unwrap())
 }
 
-/// An address that nobody listens on for now.
+/// A free address of this machine: no process listens on it for now.
 pub(crate) async fn free_address() -> String {
     server::bind("127.0.0.1:0").await.unwrap().1.to_string()
 }

@@ -1,4 +1,4 @@
-//! Who is let in: tokens, roles and limits.
+//! Which callers are accepted: tokens, roles and limits.
 
 use crate::clients::{positions, team};
 use crate::sandbox::*;
@@ -40,8 +40,8 @@ pub(crate) fn code<T>(result: Result<T, Status>) -> Option<Code> {
     result.err().map(|status| status.code())
 }
 
-/// Everybody that the tests know, by token; the name is the token, too.
-pub(crate) fn everybody(folder: &Path) -> Access {
+/// A token for every role of the tests; the name is the token, too.
+pub(crate) fn all_roles(folder: &Path) -> Access {
     let roles =
         [("fleet", "client"), ("other", "client"), ("rollouts", "actor"), ("goals", "commander"), ("ops", "admin")];
     let hashes = roles.map(|(name, _)| sha256_hex(name.as_bytes()));
@@ -62,7 +62,7 @@ const MISSING: Option<Code> = Some(Code::NotFound);
 #[tokio::test(flavor = "multi_thread")]
 async fn every_method_of_the_commander_opens_for_its_roles_only() {
     let folder = tempfile::tempdir().unwrap();
-    let config = CommanderConfig { security: guarded(everybody(folder.path())), ..CommanderConfig::default() };
+    let config = CommanderConfig { security: guarded(all_roles(folder.path())), ..CommanderConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     // What a call ends with that was let in: some of these ask for nothing that there is.
     let let_in = [None, None, None, None, INVALID, MISSING, MISSING, None, None, MISSING, None];
@@ -100,8 +100,8 @@ async fn every_method_of_the_commander_opens_for_its_roles_only() {
         ];
         assert_eq!(found, expected, "{token}");
     }
-    let mut nobody = commander_client(&commander.url).await;
-    assert_eq!(code(nobody.assign(team()).await), UNKNOWN);
+    let mut anonymous = commander_client(&commander.url).await;
+    assert_eq!(code(anonymous.assign(team()).await), UNKNOWN);
     // Health needs no token.
     let channel = magex_runtime::client::endpoint(&commander.url).unwrap().connect().await.unwrap();
     HealthClient::new(channel).check(HealthCheckRequest { service: String::new() }).await.unwrap();
@@ -124,7 +124,7 @@ async fn every_method_of_the_commander_opens_for_its_roles_only() {
 #[tokio::test(flavor = "multi_thread")]
 async fn every_method_of_the_learner_opens_for_its_roles_only() {
     let folder = tempfile::tempdir().unwrap();
-    let security = guarded(everybody(folder.path()));
+    let security = guarded(all_roles(folder.path()));
     let learner = Learner::start_with(LearnerOptions { security, ..LearnerOptions::default() }).await;
     for (token, expected) in [
         ("fleet", [DENIED, DENIED, None, None, DENIED, DENIED]),
@@ -145,15 +145,15 @@ async fn every_method_of_the_learner_opens_for_its_roles_only() {
         ];
         assert_eq!(found, expected, "{token}");
     }
-    let mut nobody = learner_client(&learner.url).await;
-    assert_eq!(code(nobody.get_run(v1::GetRunRequest {}).await), UNKNOWN);
+    let mut anonymous = learner_client(&learner.url).await;
+    assert_eq!(code(anonymous.get_run(v1::GetRunRequest {}).await), UNKNOWN);
     learner.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_actor_that_is_not_let_in_says_so_and_ends() {
     let folder = tempfile::tempdir().unwrap();
-    let security = guarded(everybody(folder.path()));
+    let security = guarded(all_roles(folder.path()));
     let learner = Learner::start_with(LearnerOptions { security, ..LearnerOptions::default() }).await;
     for (client, words) in [(Settings::default(), "authorization"), (bearing("fleet"), "role client")] {
         let config = magex_actor::run::ActorConfig { client, ..config(&learner.url, "a") };
@@ -167,7 +167,7 @@ async fn an_actor_that_is_not_let_in_says_so_and_ends() {
 async fn an_actor_that_the_commander_does_not_let_in_ends_and_its_shard_is_done_by_another() {
     let folder = tempfile::tempdir().unwrap();
     let mut learner = Learner::start().await;
-    let (security, learner_url) = (guarded(everybody(folder.path())), Some(learner.url.clone()));
+    let (security, learner_url) = (guarded(all_roles(folder.path())), Some(learner.url.clone()));
     let config = CommanderConfig { security, learner_url, ..CommanderConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     learner.collector.publish(&weights(0)).unwrap();

@@ -1,4 +1,4 @@
-//! Stopping: within the budget, whoever hangs on, and with everybody told.
+//! Stopping: within the budget, with peers that do not let go, and with every peer notified.
 
 use crate::sandbox::*;
 use magex_core::ids::Iteration;
@@ -86,8 +86,8 @@ async fn a_drain_lets_the_iteration_finish() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_drain_without_anybody_to_finish_the_iteration_ends_it() {
-    // Nobody is there; and whoever is there leaves before it is done.
+async fn a_drain_without_an_actor_to_finish_the_iteration_ends_it() {
+    // First without an actor; then with one that leaves before the iteration is done.
     for leaves in [false, true] {
         let mut learner = Learner::start().await;
         learner.collector.publish(&weights(0)).unwrap();

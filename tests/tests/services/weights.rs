@@ -1,4 +1,4 @@
-//! Weights reach everybody, and nobody waits for the slowest.
+//! Weights reach every subscriber, and none waits for the slowest.
 
 use crate::sandbox::*;
 use bytes::Bytes;

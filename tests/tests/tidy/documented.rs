@@ -1,0 +1,55 @@
+//! Keys and dependencies are documented, with the defaults that the code has.
+
+use crate::workspace::read;
+use magex_core::config::RunConfig;
+use magex_core::task::{Spawn, TaskConfig, TaskName};
+
+/// Every configuration key with its default, as TOML: the default run, and the sections of the other tasks.
+pub fn configuration() -> String {
+    let mut config = RunConfig::default().to_toml().unwrap();
+    for name in [TaskName::PushBall, TaskName::Drones] {
+        let task = TaskConfig::of(name, 4, Spawn::Uniform);
+        let other = RunConfig { task, ..RunConfig::default() }.to_toml().unwrap();
+        let own = other.split("\n\n").find(|section| section.starts_with("[task.")).unwrap();
+        config = format!("{config}\n{own}\n");
+    }
+    config
+}
+
+#[test]
+fn every_configuration_key_and_dependency_is_documented() {
+    let config = configuration();
+    let reference = read("docs/configuration.md");
+    let mut section = String::new();
+    for line in config.lines() {
+        if let Some(name) = line.strip_prefix('[') {
+            section = name.trim_end_matches(']').to_owned();
+        } else if let Some((key, value)) = line.split_once(" = ") {
+            let row = reference
+                .lines()
+                .find(|l| l.starts_with(&format!("| `{section}.{key}` ")))
+                .unwrap_or_else(|| panic!("docs/configuration.md does not list `{section}.{key}`"));
+            let shown = row.split('|').nth(2).unwrap_or("").trim().trim_matches('`');
+            let same = shown == value.trim_matches('"')
+                || matches!((shown.parse::<f64>(), value.parse::<f64>()), (Ok(a), Ok(b)) if (a - b).abs() <= 1e-6 * b.abs());
+            assert!(same, "docs/configuration.md gives `{section}.{key}` the default {shown}, the code {value}");
+        }
+    }
+    for row in reference.lines().filter(|l| l.starts_with("| `") && l.contains('.')) {
+        let name = row.split('`').nth(1).unwrap();
+        let key = name.rsplit('.').next().unwrap();
+        assert!(config.contains(&format!("{key} = ")), "docs/configuration.md lists {name}, which does not exist");
+    }
+    let dependencies = read("docs/dependencies.md");
+    let manifest = read("Cargo.toml");
+    for line in
+        manifest.split("[workspace.dependencies]").nth(1).unwrap().split("[workspace.lints").next().unwrap().lines()
+    {
+        if let Some((name, _)) = line.split_once(" = ")
+            && !name.starts_with("magex")
+            && !name.starts_with('#')
+        {
+            assert!(dependencies.contains(&format!("`{name}`")), "docs/dependencies.md does not say why {name}");
+        }
+    }
+}
