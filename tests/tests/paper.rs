@@ -178,11 +178,11 @@ fn equation_2_a_message_is_the_mean_over_the_neighbours() {
         let block = GraphBlock { agents: n, pair_hidden: p, width: f, block: 0, self_path: true, temperature: 1.0 };
         let y = graph_block(&features, &relative, &score, block, GraphNoise::Off).unwrap();
         let y: Vec<Vec<f32>> = y.to_vec2().unwrap();
-        for i in 0..n {
-            for k in 0..f {
+        for (i, row) in y.iter().enumerate() {
+            for (k, found) in row.iter().enumerate() {
                 let others = (0..n).filter(|j| *j != i).map(|j| (j * f + k) as f32 * 0.1).sum::<f32>() / (n - 1) as f32;
                 let expected = (k as f32 - 8.0 + if edges { others } else { 0.0 }).max(0.0);
-                assert!((y[i][k] - expected).abs() < 1e-5, "edges {edges}, agent {i}: {} for {expected}", y[i][k]);
+                assert!((found - expected).abs() < 1e-5, "edges {edges}, agent {i}: {found} for {expected}");
             }
         }
     }

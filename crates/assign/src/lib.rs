@@ -7,6 +7,11 @@
 //! Costs are row-major `[rows, cols]`: rows are agents, columns are goals. Either side may be the longer one; it then
 //! keeps members without a partner, marked [`UNASSIGNED`].
 
+#![allow(
+    clippy::needless_range_loop,
+    reason = "kernels index several arrays by one counter; iterators hide which elements meet"
+)]
+
 use thiserror::Error;
 
 pub mod bench;

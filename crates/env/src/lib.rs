@@ -7,6 +7,11 @@
 //!
 //! No networks, no threads, no clock (except in [`mod@bench`], which measures).
 
+#![allow(
+    clippy::needless_range_loop,
+    reason = "kernels index several arrays by one counter; iterators hide which elements meet"
+)]
+
 pub mod bench;
 pub mod drones;
 pub mod golden;

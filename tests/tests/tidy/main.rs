@@ -7,6 +7,7 @@ mod dependencies;
 mod documented;
 mod glossary;
 mod layout;
+mod numbers;
 mod prose;
 mod rust;
 mod workspace;
