@@ -20,7 +20,7 @@ pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: 
             Err(status) => status.message().to_owned(),
         };
         if !waiting {
-            tracing::warn!(reason, "no learner; trying again until there is one");
+            tracing::warn!(reason, "no learner; retrying");
             waiting = true;
         }
         tokio::time::sleep(backoff.next_wait()).await;

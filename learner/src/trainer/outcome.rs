@@ -48,7 +48,7 @@ pub enum TrainError {
     /// The run folder belongs to another configuration.
     #[error(
         "{}: the checkpoint was made with another configuration; resume without a configuration file, or start a new run",
-        folder.display()
+        .folder.display()
     )]
     OtherConfiguration {
         /// The run folder.

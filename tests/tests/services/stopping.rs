@@ -111,7 +111,7 @@ async fn a_drain_without_actors_ends_the_iteration() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_resumed_run_reports_its_last_iteration_at_once() {
-    let mut learner = Learner::start().await;
+    let learner = Learner::start().await;
     let before = IterationReport {
         iteration: Iteration(7),
         joint_env_steps: 70,
