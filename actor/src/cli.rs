@@ -1,6 +1,6 @@
 //! The actor's command line.
 
-use crate::policy::PolicyWorker;
+use crate::policy_worker::PolicyWorker;
 use crate::run::{ActorConfig, ActorError, ActorReport, run_watched};
 use clap::Args;
 use magex_core::config::RunConfig;
@@ -24,7 +24,7 @@ pub struct ActorArgs {
     /// Commander to ask for goals
     #[arg(long, env = "MAGEX_COMMANDER", default_value = "http://127.0.0.1:7100", value_name = "URL")]
     pub commander: String,
-    /// Name of this actor, for people [default: host and process number]
+    /// Name of this actor in logs and status [default: host and process number]
     #[arg(long, env = "MAGEX_ACTOR_NAME", default_value_t = process::default_name(), hide_default_value = true)]
     pub name: String,
     /// Rollout threads [default: one per processor]
@@ -36,7 +36,7 @@ pub struct ActorArgs {
     /// Wait for another run when this one is complete
     #[arg(long, env = "MAGEX_ACTOR_STAY")]
     pub stay: bool,
-    /// What operators look at
+    /// Metrics and health over HTTP
     #[command(flatten)]
     #[serde(flatten)]
     pub http: HttpArgs,
@@ -44,11 +44,11 @@ pub struct ActorArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub traces: TraceArgs,
-    /// What learner and commander are shown.
+    /// Credentials for learner and commander.
     #[command(flatten)]
     #[serde(flatten)]
     pub security: CallerArgs,
-    /// How log lines look
+    /// Format of log lines
     #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
     #[serde(skip)]
     pub log_format: LogFormat,
@@ -56,13 +56,13 @@ pub struct ActorArgs {
     #[arg(long)]
     #[serde(skip)]
     pub print_config: bool,
-    /// Ask the actor whose page is at --http whether it lives, and exit: 0 it does, 1 it does not
+    /// Check that the actor with its page at --http is alive, and exit: 0 alive, 1 not
     #[arg(long)]
     #[serde(skip)]
     pub health_check: bool,
 }
 
-/// Runs an actor until it is told to stop or the run is complete. The exit code, or why it failed.
+/// Runs an actor until shutdown or the end of the run. Returns the exit code.
 pub fn run(args: ActorArgs) -> Result<u8, Failure> {
     if args.health_check {
         return probe::own_page(args.http.http.as_deref());
@@ -93,15 +93,15 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
         }
         run_watched(config, PolicyWorker::maker(), &metrics, stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
-            // A new process may fare better.
-            ActorError::SentAway { .. } => Failure::new(exit::INTERNAL, &error),
-            ActorError::Refused { .. } | ActorError::Useless(_) | ActorError::Worker { .. } => {
+            // A restarted process may succeed.
+            ActorError::Evicted { .. } => Failure::new(exit::INTERNAL, &error),
+            ActorError::Refused { .. } | ActorError::Unusable(_) | ActorError::Worker { .. } => {
                 Failure::new(exit::UNAVAILABLE, &error)
             }
         })
     });
     telemetry.flush();
-    // A rollout thread may still be busy with a shard that nobody wants.
+    // A rollout thread may still be busy with a cancelled shard.
     runtime.shutdown_background();
     let report = end?;
     let ActorReport { sessions, accepted, duplicate, rejected, failed } = report;

@@ -1,12 +1,26 @@
-//! magex-actor
-pub mod cache;
+//! The actor: it leases shards from the learner, rolls them out with the published weights and returns the results.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`run`] | the actor's loop: connect, work, reconnect, until shutdown or the end of the run |
+//! | `session` | one connection to the learner: leases in, results out |
+//! | `rollout_pool` | the rollout threads of one run |
+//! | [`worker`] | the seam between the pool and the rollout |
+//! | [`policy_worker`] | the worker of production: the executor that the weights contain |
+//! | [`rollout`] | the rollout of one shard: a pure function of shard, seed, task, weights and goals |
+//! | [`goal_client`] | the goals of a shard, from the commander service |
+//! | `weights_feed`, [`weights_cache`] | the stream of weights, and the two latest versions |
+//! | `metrics` | the actor's Prometheus metrics |
+//! | [`cli`] | the command line of `magex-actor` |
+
 pub mod cli;
-mod crew;
-mod gauges;
-pub mod goals;
-mod link;
-pub mod policy;
+pub mod goal_client;
+mod metrics;
+pub mod policy_worker;
 pub mod rollout;
+mod rollout_pool;
 pub mod run;
+mod session;
+pub mod weights_cache;
 mod weights_feed;
 pub mod worker;

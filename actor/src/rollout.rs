@@ -18,7 +18,7 @@ use magex_nets::params::{ParamError, Params, Source, from_safetensors};
 use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
 use std::sync::Arc;
 
-/// Why a shard could not be rolled out. E is the error of whoever hands out goals.
+/// Why a shard could not be rolled out. E is the error of the goal source.
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError<E> {
     /// The environment refused.

@@ -1,16 +1,16 @@
-//! The actor: connects, works, connects again, until told to stop or the run is complete.
+//! The actor's loop: connect, work, reconnect, until shutdown or the end of the run.
 
-use crate::cache::WeightsCache;
-use crate::crew::{Crew, Tools};
-use crate::gauges::ActorGauges;
-pub use crate::link::ActorReport;
-use crate::link::{self, End, Link, Unsettled};
+use crate::metrics::ActorMetrics;
+use crate::rollout_pool::{PoolContext, RolloutPool};
+pub use crate::session::ActorReport;
+use crate::session::{self, Session, SessionEnd, UnacknowledgedResults};
+use crate::weights_cache::WeightsCache;
 use crate::weights_feed;
 use crate::worker::{MakeWorker, Welcome, WorkError};
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::{MAX_MESSAGE_BYTES, PROTOCOL_VERSION, v1};
-use magex_runtime::backoff::{Backoff, incarnation};
+use magex_runtime::backoff::{Backoff, random_id};
 use magex_runtime::client::{Channel, Settings, UrlError};
 use magex_runtime::metrics::Metrics;
 use std::sync::Arc;
@@ -19,11 +19,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 
-/// The learner answers a hello within this time, or the connection is made anew.
+/// The learner answers a hello within this time, or the actor reconnects.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Rollout threads may finish what they do within this time after the actor was told to stop.
-const DISMISS_TIMEOUT: Duration = Duration::from_secs(3);
+/// Rollout threads have this time to end after a shutdown.
+const POOL_SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Where an actor works.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,28 +32,28 @@ pub struct ActorConfig {
     pub learner_url: String,
     /// The commander, `http://host:port`.
     pub commander_url: String,
-    /// What both are shown.
+    /// The credentials and TLS settings for both.
     pub client: Settings,
     /// Name of the actor, for people.
     pub actor_id: String,
     /// Rollout threads, at least 1.
     pub threads: usize,
-    /// Fingerprint of the task that the actor insists on; `None` takes the learner's.
+    /// Fingerprint of the task that the actor requires; `None` accepts the learner's.
     pub expected_task: Option<String>,
-    /// Keep waiting for another run after this one is complete.
+    /// Wait for another run after this one is complete.
     pub stay: bool,
 }
 
-/// Why an actor gave up.
+/// Why an actor ended.
 #[derive(Debug, thiserror::Error)]
 pub enum ActorError {
     /// An address is wrong.
     #[error(transparent)]
     Url(#[from] UrlError),
     /// No rollout threads.
-    #[error("threads: 0 rollout threads do nothing; use --threads 1 or more")]
+    #[error("threads: 0 is too few; use --threads 1 or more")]
     NoThreads,
-    /// The learner does not want this actor.
+    /// The learner rejected this actor.
     #[error("the learner at {url} refused: {reason}")]
     Refused {
         /// Address of the learner.
@@ -61,18 +61,18 @@ pub enum ActorError {
         /// What it said.
         reason: String,
     },
-    /// The learner cannot use what this actor computes.
-    #[error("the learner at {url} sent this actor away: {reason}")]
-    SentAway {
+    /// The learner evicted this actor process: its results are invalid, or its shards fail.
+    #[error("the learner at {url} evicted this actor: {reason}")]
+    Evicted {
         /// Address of the learner.
         url: String,
         /// What it said.
         reason: String,
     },
-    /// No shard can be done here.
-    #[error("this actor can do no shard: {0}")]
-    Useless(WorkError),
-    /// The run's work cannot be done here.
+    /// An error that every shard would meet.
+    #[error("this actor cannot process any shard: {0}")]
+    Unusable(WorkError),
+    /// This build cannot work on the run.
     #[error("cannot work on run '{run_id}': {source}")]
     Worker {
         /// The run.
@@ -82,8 +82,8 @@ pub enum ActorError {
     },
 }
 
-/// Works until `shutdown`, or until the run is complete. A learner that is late or away is waited for; one that refuses
-/// the actor ends it.
+/// Works until `shutdown`, or until the run is complete. An actor retries while the learner is unavailable and ends when
+/// the learner rejects or evicts it.
 pub async fn run(
     config: ActorConfig,
     make_worker: MakeWorker,
@@ -92,7 +92,7 @@ pub async fn run(
     run_watched(config, make_worker, &Metrics::new(), shutdown).await
 }
 
-/// [`run`], counting what it does.
+/// [`run`], with its metrics in `metrics`.
 pub async fn run_watched(
     config: ActorConfig,
     make_worker: MakeWorker,
@@ -105,42 +105,42 @@ pub async fn run_watched(
     let cache = Arc::new(WeightsCache::default());
     let commander = config.client.lazy_channel(&config.commander_url)?;
     let runtime = tokio::runtime::Handle::current();
-    // Two connections: results on the one never delay weights on the other.
-    let gauges = Arc::new(ActorGauges::new(metrics));
+    // Two connections: results never delay weights.
+    let metrics = Arc::new(ActorMetrics::new(metrics));
     let feed = config.client.lazy_channel(&config.learner_url)?;
-    let feed = weights_feed::follow(feed, config.actor_id.clone(), cache.clone(), gauges.clone());
+    let feed = weights_feed::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone());
     let feed = tokio::spawn(feed);
-    let tools = Tools { make_worker, cache, commander, runtime, gauges };
+    let context = PoolContext { make_worker, cache, commander, runtime, metrics };
     let bulk = config.client.lazy_channel(&config.learner_url)?;
     let mut actor = Actor {
         config,
-        tools,
+        context,
         bulk,
-        incarnation: incarnation(),
-        crew: None,
-        unsettled: Unsettled::default(),
+        process_id: random_id(),
+        pool: None,
+        unacknowledged: UnacknowledgedResults::default(),
         report: ActorReport::default(),
     };
-    let end = actor.work(&shutdown).await;
+    let end = actor.run(&shutdown).await;
     feed.abort();
-    if let Some(crew) = actor.crew.take() {
-        let _ = tokio::time::timeout(DISMISS_TIMEOUT, crew.dismiss()).await;
+    if let Some(pool) = actor.pool.take() {
+        let _ = tokio::time::timeout(POOL_SHUTDOWN_TIMEOUT, pool.shut_down()).await;
     }
     end.map(|()| actor.report)
 }
 
 struct Actor {
     config: ActorConfig,
-    tools: Tools,
+    context: PoolContext,
     bulk: Channel,
-    incarnation: u64,
-    crew: Option<Crew>,
-    unsettled: Unsettled,
+    process_id: u64,
+    pool: Option<RolloutPool>,
+    unacknowledged: UnacknowledgedResults,
     report: ActorReport,
 }
 
 impl Actor {
-    async fn work(&mut self, shutdown: &CancellationToken) -> Result<(), ActorError> {
+    async fn run(&mut self, shutdown: &CancellationToken) -> Result<(), ActorError> {
         let mut backoff = Backoff::default();
         let mut waiting = false;
         loop {
@@ -150,30 +150,26 @@ impl Actor {
                 (backoff, waiting) = (Backoff::default(), false);
             }
             match end {
-                End::Shutdown => return Ok(()),
-                End::Finished if !self.config.stay => {
+                SessionEnd::Shutdown => return Ok(()),
+                SessionEnd::Finished if !self.config.stay => {
                     tracing::info!(accepted = self.report.accepted, "the run is complete");
                     return Ok(());
                 }
-                End::Finished if waiting => tracing::debug!("no other run yet"),
-                End::Finished => {
+                SessionEnd::Finished if waiting => tracing::debug!("no other run yet"),
+                SessionEnd::Finished => {
                     tracing::info!("the run is complete; waiting for another");
                     waiting = true;
                 }
-                End::Refused(reason) => {
+                SessionEnd::Refused(reason) => {
                     return Err(ActorError::Refused { url: self.config.learner_url.clone(), reason });
                 }
-                End::SentAway(reason) => {
-                    return Err(ActorError::SentAway { url: self.config.learner_url.clone(), reason });
+                SessionEnd::Evicted(reason) => {
+                    return Err(ActorError::Evicted { url: self.config.learner_url.clone(), reason });
                 }
-                End::Useless(error) => return Err(ActorError::Useless(error)),
-                End::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
-                End::Broken(reason) => {
-                    tracing::warn!(
-                        reason,
-                        url = self.config.learner_url,
-                        "no learner; trying again until there is one"
-                    );
+                SessionEnd::Unusable(error) => return Err(ActorError::Unusable(error)),
+                SessionEnd::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
+                SessionEnd::Broken(reason) => {
+                    tracing::warn!(reason, url = self.config.learner_url, "no learner; retrying");
                     waiting = true;
                 }
             }
@@ -185,34 +181,35 @@ impl Actor {
     }
 
     /// One connection, from hello to its end.
-    async fn session(&mut self, shutdown: &CancellationToken) -> Result<End, ActorError> {
+    async fn session(&mut self, shutdown: &CancellationToken) -> Result<SessionEnd, ActorError> {
         let (outbound, requests) = mpsc::channel(4);
         let hello = v1::RolloutRequest { message: Some(Request::Hello(self.hello())) };
-        // The first message must be there before the call: its answer comes only after it.
+        // The hello is queued before the call: the learner answers the call only after it has arrived.
         if outbound.send(hello).await.is_err() {
-            return Ok(End::Broken("the request stream closed".to_owned()));
+            return Ok(SessionEnd::Broken("the request stream closed".to_owned()));
         }
         let mut client = LearnerServiceClient::new(self.bulk.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
-        let greeting = async {
+        let handshake = async {
             let mut inbound = client.rollout(ReceiverStream::new(requests)).await?.into_inner();
-            let welcome = link::welcome(&mut inbound).await?;
-            Ok::<_, End>((inbound, welcome))
+            let welcome = session::welcome(&mut inbound).await?;
+            Ok::<_, SessionEnd>((inbound, welcome))
         };
-        let greeting = tokio::time::timeout(HELLO_TIMEOUT, greeting);
-        let (inbound, welcome) = match shutdown.run_until_cancelled(greeting).await {
-            None => return Ok(End::Shutdown),
-            Some(Err(_)) => return Ok(End::Broken("the learner did not answer in time".to_owned())),
+        let handshake = tokio::time::timeout(HELLO_TIMEOUT, handshake);
+        let (inbound, welcome) = match shutdown.run_until_cancelled(handshake).await {
+            None => return Ok(SessionEnd::Shutdown),
+            Some(Err(_)) => return Ok(SessionEnd::Broken("the learner did not answer in time".to_owned())),
             Some(Ok(Err(end))) => return Ok(end),
-            Some(Ok(Ok(greeted))) => greeted,
+            Some(Ok(Ok(accepted))) => accepted,
         };
         self.report.sessions += 1;
-        let gauges = self.tools.gauges.clone();
-        gauges.reconnects.add(u64::from(self.report.sessions > 1));
-        let crew = self.crew_for(welcome).await?;
-        gauges.connected.set(1.0);
-        let link = Link::new(self.crew.insert(crew), &mut self.unsettled, &mut self.report, &gauges, outbound);
-        let end = link.serve(inbound, shutdown).await;
-        gauges.connected.set(0.0);
+        let metrics = self.context.metrics.clone();
+        metrics.reconnects.add(u64::from(self.report.sessions > 1));
+        let pool = self.pool_for(welcome).await?;
+        metrics.connected.set(1.0);
+        let session =
+            Session::new(self.pool.insert(pool), &mut self.unacknowledged, &mut self.report, &metrics, outbound);
+        let end = session.run(inbound, shutdown).await;
+        metrics.connected.set(0.0);
         Ok(end)
     }
 
@@ -220,30 +217,30 @@ impl Actor {
         v1::Hello {
             protocol_version: PROTOCOL_VERSION,
             actor_id: self.config.actor_id.clone(),
-            incarnation: self.incarnation,
+            process_id: self.process_id,
             task_fingerprint: self.config.expected_task.clone().unwrap_or_default(),
             threads: self.config.threads as u32,
         }
     }
 
-    /// The crew that works on this run: the one there is if the run is the same, with all that it has in hand.
-    async fn crew_for(&mut self, welcome: Welcome) -> Result<Crew, ActorError> {
-        match self.crew.take() {
-            Some(crew) if crew.welcome == welcome => {
-                tracing::info!(run_id = %welcome.run_id, "connected again");
-                Ok(crew)
+    /// The pool for this run. The present pool is kept, with the shards it holds, if the run is the same.
+    async fn pool_for(&mut self, welcome: Welcome) -> Result<RolloutPool, ActorError> {
+        match self.pool.take() {
+            Some(pool) if pool.welcome == welcome => {
+                tracing::info!(run_id = %welcome.run_id, "reconnected");
+                Ok(pool)
             }
             old => {
                 if let Some(old) = old {
-                    tracing::info!(run_id = %welcome.run_id, "another run; dropping work on the old one");
-                    self.unsettled.clear();
-                    drop(old.dismiss());
+                    tracing::info!(run_id = %welcome.run_id, "another run; discarding the work on the previous one");
+                    self.unacknowledged.clear();
+                    drop(old.shut_down());
                 }
                 tracing::info!(run_id = %welcome.run_id, threads = self.config.threads, "joined a run");
                 let run_id = welcome.run_id.0.clone();
                 let failed = |source| ActorError::Worker { run_id: run_id.clone(), source };
-                let (threads, tools) = (self.config.threads, self.tools.clone());
-                tokio::task::spawn_blocking(move || Crew::start(welcome, threads, tools))
+                let (threads, context) = (self.config.threads, self.context.clone());
+                tokio::task::spawn_blocking(move || RolloutPool::start(welcome, threads, context))
                     .await
                     .map_err(|error| failed(WorkError::fatal(error.to_string())))?
                     .map_err(failed)

@@ -10,7 +10,7 @@ use crate::store::Store;
 use magex_dispatch::mission::Planned;
 use magex_dispatch::{DispatchError, Problem, answer, engine};
 use magex_proto::v1;
-use magex_runtime::backoff::incarnation;
+use magex_runtime::backoff::random_id;
 use magex_runtime::status;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -106,7 +106,7 @@ pub(crate) type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
 impl Answering {
     pub(crate) fn new(store: Arc<Store>, gauges: Arc<CommanderGauges>) -> Arc<Self> {
         let processors = Arc::new(Semaphore::new(magex_runtime::process::processors()));
-        let (memory, next_seed) = (Arc::new(Semaphore::new(UNITS)), AtomicU64::new(incarnation()));
+        let (memory, next_seed) = (Arc::new(Semaphore::new(UNITS)), AtomicU64::new(random_id()));
         let pace = AtomicU64::new(u64::MAX);
         Arc::new(Self { store, gauges, processors, memory, pace, next_seed })
     }

@@ -9,7 +9,7 @@ use magex_dispatch::missions::{KeepError, Missions, passes};
 use magex_dispatch::{DispatchError, Problem};
 use magex_proto::v1;
 use magex_runtime::access::{Caller, Role};
-use magex_runtime::backoff::incarnation;
+use magex_runtime::backoff::random_id;
 use magex_runtime::status;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -76,7 +76,7 @@ impl Keeper {
             let _held = places;
             own.missions.check_room(&caller.name).map_err(kept)?;
             let (now, each) = (now_ms(), own.missions.bounds().each);
-            let drawn = format!("m-{:016x}", incarnation());
+            let drawn = format!("m-{:016x}", random_id());
             let planner = |problem: &Problem| own.plan(problem, &waits);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(refusal)?;
             waits.check()?;

@@ -2,19 +2,15 @@
 
 use crate::scheduler::{LoadScheduler, WeightsKey};
 use crate::store::{Model, Store};
-use magex_proto::v1::learner_service_client::LearnerServiceClient;
-use magex_proto::weights::{Weights, WeightsAssembler};
-use magex_proto::{MAX_MESSAGE_BYTES, v1};
+use magex_proto::v1::SubscriberRole;
+use magex_proto::weights::Weights;
+use magex_proto::weights_watch::{OPEN_TIMEOUT, WeightsStream, late};
 use magex_runtime::backoff::Backoff;
 use magex_runtime::client::Channel;
 use std::sync::Arc;
-use std::time::Duration;
 use tonic::Status;
 
-/// A learner that does not begin to answer within this time is asked again.
-const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
-
-/// Follows the learner's weights for ever, through every break of the connection.
+/// Follows the learner's weights and reconnects after every failure. Never returns.
 pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: LoadScheduler) {
     let mut backoff = Backoff::default();
     let mut waiting = false;
@@ -24,7 +20,7 @@ pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: 
             Err(status) => status.message().to_owned(),
         };
         if !waiting {
-            tracing::warn!(reason, "no learner; trying again until there is one");
+            tracing::warn!(reason, "no learner; retrying");
             waiting = true;
         }
         tokio::time::sleep(backoff.next_wait()).await;
@@ -38,31 +34,14 @@ async fn watch(
     backoff: &mut Backoff,
     waiting: &mut bool,
 ) -> Result<(), Status> {
-    let mut client = LearnerServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
-    let request = v1::WatchWeightsRequest {
-        run_id: String::new(),
-        subscriber_id: "commander".to_owned(),
-        role: v1::SubscriberRole::Commander.into(),
-    };
-    // The stream itself may be silent for as long as an update takes; a learner that is gone is noticed by the connection.
-    let opened = tokio::time::timeout(OPEN_TIMEOUT, client.watch_weights(request)).await;
-    let late = |_| Status::deadline_exceeded("the learner did not answer in time");
-    let mut stream = opened.map_err(late)??.into_inner();
-    let mut assembler = WeightsAssembler::default();
-    while let Some(message) = stream.message().await? {
-        if *waiting {
+    let opening = WeightsStream::open(channel, "commander", SubscriberRole::Commander);
+    let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
+    while let Some((weights, toml)) = stream.next().await? {
+        if std::mem::take(waiting) {
             tracing::info!("connected to a learner");
         }
-        *waiting = false;
         backoff.reset();
-        match assembler.push(message) {
-            Ok(Some((weights, toml))) => load(weights, toml, store, load_scheduler).await,
-            Ok(None) => {}
-            Err(error) => {
-                tracing::warn!(%error, "damaged weights; asking for them again");
-                return Err(Status::data_loss(error.to_string()));
-            }
-        }
+        load(weights, toml, store, load_scheduler).await;
     }
     Ok(())
 }

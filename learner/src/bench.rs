@@ -35,11 +35,8 @@ pub fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Resul
     // One episode is one minibatch.
     config.task.horizon = (units * chunk) as u32;
     let trajectory = synthetic(&config, minibatches);
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(1)
-        .stack_size(64 << 20)
-        .build()
-        .map_err(|e| TrainError::Configuration(format!("training threads: {e}")))?;
+    let pool =
+        rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(64 << 20).build().map_err(TrainError::Threads)?;
     pool.install(|| {
         let mut time = [Vec::new(), Vec::new()];
         for round in 0..=rounds {

@@ -2,16 +2,16 @@
 
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::page::{LivePage, RunInfo};
-use crate::run_folder::Standing;
+use crate::run_folder::{CONFIG_FILE, RunFolderState};
 use crate::run_identity::RunIdentity;
 use crate::serve::service::{LearnerHandle, learner_service};
 use crate::serve::validate::Limits;
-use crate::trainer::{Outcome, Trainer};
+use crate::trainer::{TrainOutcome, Trainer, max_shard_episodes};
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_proto::v1;
-use magex_runtime::backoff::incarnation;
+use magex_runtime::backoff::random_id;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
 use magex_runtime::http::{HttpArgs, Page};
@@ -24,14 +24,8 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
-/// Name of the effective configuration in a run folder.
-pub const CONFIG_FILE: &str = "config.toml";
-
-/// Most episodes that an evaluation shard has: a limit on what is taken in, no more.
-const EVAL_SHARD_LIMIT: u32 = 64;
-
-/// How long the trainer may take to come to the end of its iteration when the process is told to stop. Checkpoints are
-/// written so that leaving at any moment is safe.
+/// How long the trainer may take to end its iteration after a shutdown. The process may exit at any moment without damage to
+/// its checkpoints.
 const STOP_BUDGET: Duration = Duration::from_secs(8);
 
 /// Differentiation recurses through the graph.
@@ -52,47 +46,47 @@ pub struct LearnerArgs {
     /// Continue the run in that folder
     #[arg(long, env = "MAGEX_RESUME")]
     pub resume: bool,
-    /// Continue the run in that folder if there is one, begin it otherwise: for whatever starts the same command again
+    /// Continue the run in that folder if there is one, begin it otherwise: for supervisors that repeat the same command
     #[arg(long, env = "MAGEX_RESUME_OR_CREATE", conflicts_with = "resume")]
     pub resume_or_create: bool,
-    /// Go on serving when the run is complete, until told to stop
+    /// Continue serving after the run is complete, until shutdown
     #[arg(long, env = "MAGEX_LEARNER_STAY")]
     pub stay: bool,
     /// Address to listen on; port 0 is any free one
     #[arg(long, env = "MAGEX_LEARNER_LISTEN", default_value = "127.0.0.1:7000", value_name = "HOST:PORT")]
     pub listen: String,
-    /// An actor that says nothing for so long loses its leases
+    /// Silence after which an actor loses its leases
     #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS")]
     pub lease_seconds: f64,
-    /// How the port is guarded.
+    /// TLS and access rules of the port.
     #[command(flatten)]
     pub security: ServerArgs,
     /// Training threads [default: one per processor]
     #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
     pub threads: usize,
-    /// What operators look at
+    /// Live page, metrics and health over HTTP
     #[command(flatten)]
     pub http: HttpArgs,
-    /// Where traces go
+    /// Export of traces
     #[command(flatten)]
     pub traces: TraceArgs,
-    /// How log lines look
+    /// Format of log lines
     #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
     /// Print the run's configuration in effect and exit
     #[arg(long)]
     pub print_config: bool,
-    /// Ask the learner that listens on --listen whether it serves, and exit: 0 it does, 1 it does not
+    /// Check that the learner on --listen serves, and exit: 0 it serves, 1 it does not
     #[arg(long)]
     pub health_check: bool,
 }
 
-/// Trains until the run is complete or told to stop. The exit code, or why it failed.
+/// Trains until the run is complete or stopped. Returns the exit code.
 pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
     if args.health_check {
         return probe::own(&args.listen, args.security.tls_cert.is_some());
     }
-    args.resume |= args.resume_or_create && Standing::of(&args.out) == Standing::Run;
+    args.resume |= args.resume_or_create && RunFolderState::of(&args.out) == RunFolderState::Run;
     let config = configure(&args)?;
     let toml = config.to_toml().map_err(Failure::usage)?;
     if args.print_config {
@@ -116,7 +110,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         let _runtime = runtime.enter();
         telemetry::init("magex-learner", args.log_format, &args.traces).map_err(Failure::usage)?
     };
-    // A port that cannot be had must not leave a run folder behind.
+    // Bound first: a port that is not available must not leave a run folder behind.
     let (incoming, address) =
         runtime.block_on(server::bind(&args.listen)).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
     let incoming = incoming.within(args.security.connections());
@@ -130,16 +124,17 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         seed: config.run.seed,
         lease,
     };
-    let most = (config.collect.episodes_per_iteration / config.collect.shards_per_iteration).max(EVAL_SHARD_LIMIT);
     let live = RunInfo { name: identity.name.clone(), learner: Some(address.to_string()), lease: Some(lease) };
-    let (handle, mut collector) = learner_service(identity, Limits::for_task(&config.task, most as usize));
+    let limits = Limits::for_task(&config.task, max_shard_episodes(&config) as usize);
+    let (handle, mut collector) = learner_service(identity, limits);
+    trainer.observe(handle.observer());
     let handle = handle.guarded(security);
     let end = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
         process::announce_ready("learner", Some(address), page.as_ref().map(Page::address));
         let showing = page.map(|page| {
             let live = Arc::new(LivePage::new(&config, live));
-            trainer.show(live.clone());
+            trainer.observe(live.clone());
             let status = handle.clone();
             let routes = handle.routes().merge(live.routes(move || Some(status.status())));
             (live, page.serve(routes, stop.clone()))
@@ -150,7 +145,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
             .name("magex-train".to_owned())
             .stack_size(TRAINER_STACK)
             .spawn(move || {
-                // Nobody listens when the process is going down.
+                // The receiver is gone when the process shuts down.
                 let _ = ended.send(trainer.run(&mut collector));
             })
             .map_err(|error| Failure::new(exit::INTERNAL, error))?;
@@ -158,44 +153,46 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
             outcome = training_end => Some(outcome),
             () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
         };
-        if args.stay && matches!(outcome, Some(Ok(Ok(Outcome::Finished(_))))) {
-            tracing::info!("the run is complete; serving its weights until told to stop");
+        if args.stay && matches!(outcome, Some(Ok(Ok(TrainOutcome::Finished(_))))) {
+            tracing::info!("the run is complete; serving its weights until shutdown");
             tokio::select! {
                 () = stop.cancelled() => {}
-                () = handle.told() => {}
+                () = handle.stop_signal() => {}
             }
         } else if let Some((live, _)) = showing.as_ref().filter(|_| !stop.is_cancelled()) {
             live.farewell().await;
         }
-        // Tells the actors, ends the streams, closes the port.
+        // Notifies the actors, ends the streams and closes the port.
         stop.cancel();
         serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
         if let Some((_, showing)) = showing {
-            // Ends with the server at the latest, which has the same grace.
+            // Ends no later than the server, which has the same grace period.
             let _ = showing.await;
         }
         log_ledger(&handle.status());
         match outcome {
             Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
-            Some(Err(_)) => Err(Failure::new(exit::INTERNAL, "the training thread died")),
+            Some(Err(_)) => {
+                Err(Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above"))
+            }
             None => Ok(None),
         }
     });
     telemetry.flush();
     runtime.shutdown_background();
     let reason = match end? {
-        Some(Outcome::Finished(_)) => return Ok(exit::OK),
-        Some(Outcome::Stopped(reason)) => reason.to_string(),
-        None => "the iteration did not end in time; its last checkpoint stands".to_owned(),
+        Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
+        Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
+        None => "the iteration did not end in time; the last checkpoint remains valid".to_owned(),
     };
     tracing::info!(reason, out = %args.out.display(), "stopped; continue with --resume");
     Ok(exit::TEMPORARY)
 }
 
-/// What became of everything that was leased.
+/// Logs how all leases ended.
 fn log_ledger(status: &v1::RunStatus) {
-    for (counted, books) in [("shards", &status.ledger), ("episodes", &status.episodes)] {
-        let Some(b) = books else { continue };
+    for (counted, totals) in [("shards", &status.ledger), ("episodes", &status.episodes)] {
+        let Some(b) = totals else { continue };
         tracing::info!(
             counted,
             leased = b.leased,
@@ -246,23 +243,21 @@ fn prepare(args: &LearnerArgs, config: &RunConfig, toml: &str) -> Result<Trainer
         return Ok(trainer);
     }
     create_folder(&args.out, toml, args.resume_or_create)?;
-    let run_id = RunId(format!("{:016x}", incarnation()));
+    let run_id = RunId(format!("{:016x}", random_id()));
     Trainer::create(config, run_id, &args.out, args.threads).map_err(|error| failed(&error))
 }
 
-/// A new run never touches the folder of another. What a learner left that died before its first checkpoint may be begun
-/// again where that was asked for.
+/// Creates the folder of a new run; the folder of another run is never changed. With `again`, a run that ended before its first
+/// checkpoint begins again.
 fn create_folder(out: &Path, toml: &str, again: bool) -> Result<(), Failure> {
     let named = |error: &dyn Display| Failure::new(exit::CANNOT_CREATE, format!("{}: {error}", out.display()));
-    match Standing::of(out) {
-        Standing::Empty => {}
-        Standing::Begun if again => tracing::info!("nothing was trained here yet; beginning again"),
-        Standing::Other if again => {
-            return Err(named(
-                &"there is something that is no run, or a run without checkpoints; choose another --out",
-            ));
+    match RunFolderState::of(out) {
+        RunFolderState::Empty => {}
+        RunFolderState::Begun if again => tracing::info!("nothing has been trained in this folder; beginning again"),
+        RunFolderState::Other if again => {
+            return Err(named(&"is not a run folder, or its checkpoints are missing; choose another --out"));
         }
-        _ => return Err(named(&"there is something already; continue a run with --resume, or choose another --out")),
+        _ => return Err(named(&"exists already; continue a run with --resume, or choose another --out")),
     }
     std::fs::create_dir_all(out).map_err(|error| named(&error))?;
     replace_file(&mut FileSystem, out, CONFIG_FILE, toml.as_bytes()).map_err(|error| named(&error))

@@ -2,11 +2,12 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | [`trainer`] | the training loop: publish, collect, update, record, checkpoint |
+//! | [`trainer`] | the training loop: publish, plan, collect, evaluate, update, record, checkpoint |
 //! | [`train`] | the algorithms: MAPPO for the executor, PPO for the goal commander |
 //! | [`serve`] | the gRPC service: sessions, the ledger of leases, validation of results, the weights board |
-//! | [`report`] | what a run writes for people: metrics.jsonl, summary.json, event files |
-//! | [`collector`], [`run_events`] | the seam between the training loop and the service |
+//! | [`report`] | the observers of a run: metrics.jsonl, summary.json, TensorBoard, the bottleneck of an iteration |
+//! | [`collector`] | the seam between the training loop and the actors |
+//! | [`run_events`], [`run_identity`] | what a run reports, and how it is identified |
 //! | [`checkpoint`] | what a resume needs |
 //! | [`page`] | the live page |
 //! | [`cli`] | the command line of `magex-learner` |

@@ -8,7 +8,7 @@ mod routes;
 pub mod scene;
 mod state;
 
-pub use state::{LivePage, Phase, RunInfo};
+pub use state::{LivePage, Phase, RunEnd, RunInfo};
 
 #[cfg(test)]
 mod tests;

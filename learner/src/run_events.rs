@@ -1,16 +1,15 @@
-//! What a run tells whoever watches it, and why collecting or training ends.
+//! Events of a run, and the reasons for which collecting or training ends.
 
-use crate::serve::ledger::PlanError;
-use crate::serve::validate::describe;
-use magex_core::ids::{Iteration, Shard, WeightsVersion};
+use magex_core::ids::{Iteration, RunId, Shard, WeightsVersion};
+use magex_nets::params::ParamError;
 use std::fmt;
 
 /// Why the learner stops before the end of the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum StopReason {
-    /// The process was told to stop.
+    /// The process shuts down.
     Shutdown,
-    /// An operator asked for it.
+    /// An operator requested it.
     Drain(String),
 }
 
@@ -24,29 +23,70 @@ impl fmt::Display for StopReason {
     }
 }
 
-/// Why a plan did not get done.
+/// A plan that cannot be opened.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PlanError {
+    /// There are no shards.
+    #[error("the plan has no shards")]
+    Empty,
+    /// The same shard twice.
+    #[error("the plan names shard {0} of iteration {1} twice")]
+    Repeated(u32, u32),
+    /// The previous plan is not complete.
+    #[error("a plan is open with {done} of {total} shards done")]
+    Open {
+        /// Shards done.
+        done: usize,
+        /// Shards of the plan.
+        total: usize,
+    },
+}
+
+/// Why a plan was not collected.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
-    /// The learner stops; nothing of the plan is kept.
+    /// The learner stops; the results of the plan are discarded.
     #[error("stopped ({0})")]
     Stopped(StopReason),
     /// A shard failed on every attempt.
     #[error("{} failed on every attempt, the last time with: {reason}", describe(.shard))]
     Shard {
-        /// Which.
+        /// The shard.
         shard: Shard,
-        /// What the last actor said.
+        /// The reason of the last failure.
         reason: String,
     },
-    /// The plan makes no sense.
+    /// The plan is invalid.
     #[error("plan: {0}")]
     Plan(#[from] PlanError),
     /// The plan names weights that no actor can have.
     #[error("plan: names weights version {0}, which is not among the latest two that were published")]
     Version(WeightsVersion),
-    /// Anything else.
-    #[error("{0}")]
-    Other(String),
+    /// Results were awaited without a plan.
+    #[error("plan: no plan is open")]
+    NoPlan,
+    /// A plan was collected before any weights were published.
+    #[error("weights: none were published before the plan")]
+    NoWeights,
+    /// The published weights belong to another run.
+    #[error("run_id: weights of run '{weights}' published to run '{own}'")]
+    OtherRun {
+        /// Run of the weights.
+        weights: RunId,
+        /// Run that is served.
+        own: RunId,
+    },
+    /// The published weights do not fit the configuration.
+    #[error("weights: {0}")]
+    Weights(#[from] ParamError),
+    /// A rollout thread of this process panicked.
+    #[error("a rollout thread panicked; its message is in the log above")]
+    RolloutThread,
+}
+
+/// The name of a shard in messages.
+pub(crate) fn describe(shard: &Shard) -> String {
+    format!("{:?} shard {} of iteration {}", shard.kind, shard.index, shard.iteration).to_lowercase()
 }
 
 /// Something that happened in the run.
@@ -54,7 +94,7 @@ pub enum CollectError {
 pub enum RunEvent {
     /// An iteration was completed.
     Iteration(IterationReport),
-    /// Something to tell a person.
+    /// A message for people.
     Log(String),
     /// A checkpoint was written.
     Checkpoint {
@@ -70,7 +110,7 @@ pub enum RunEvent {
     },
 }
 
-/// What an iteration was like.
+/// Results of an iteration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IterationReport {
     /// Iterations completed.
@@ -86,8 +126,8 @@ pub struct IterationReport {
 }
 
 impl IterationReport {
-    /// What a line of metrics.jsonl says; `None` if it is not one.
-    pub(crate) fn of(line: String) -> Option<Self> {
+    /// Parses a line of metrics.jsonl; `None` if it is not one.
+    pub(crate) fn parse(line: String) -> Option<Self> {
         let metrics: serde_json::Value = serde_json::from_str(&line).ok()?;
         Some(Self {
             iteration: Iteration(u32::try_from(metrics["iteration"].as_u64()?).ok()?),

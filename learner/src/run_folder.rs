@@ -1,30 +1,33 @@
-//! How a run folder stands when a learner is started on it.
+//! The state of a run folder when a learner is started on it.
 
 use crate::checkpoint;
 use std::fs;
 use std::path::Path;
 
-/// What there is in the folder of a run.
+/// Name of the effective configuration in a run folder.
+pub(crate) const CONFIG_FILE: &str = "config.toml";
+
+/// What a run folder contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Standing {
+pub(crate) enum RunFolderState {
     /// Nothing, or no folder.
     Empty,
-    /// What a learner leaves that died before its first checkpoint was whole: nothing of it has been trained.
+    /// A run whose learner ended before its first checkpoint was complete: nothing has been trained.
     Begun,
     /// A run that can be continued, or is complete.
     Run,
-    /// Something else, or a run whose checkpoints are gone.
+    /// Something else, or a run without checkpoints.
     Other,
 }
 
-impl Standing {
-    /// Looks at a folder. A folder that cannot be read counts as something else: it must not be written over.
+impl RunFolderState {
+    /// Inspects a folder. An unreadable folder counts as [`Self::Other`], which is never overwritten.
     pub(crate) fn of(out: &Path) -> Self {
         let names: Vec<String> = match fs::read_dir(out) {
             Ok(entries) => entries
                 .filter_map(Result::ok)
                 .map(|entry| entry.file_name().to_string_lossy().into_owned())
-                // The root of a new file system is not quite empty.
+                // The root of a new file system contains this folder.
                 .filter(|name| name != "lost+found")
                 .collect(),
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Self::Empty,
@@ -37,10 +40,10 @@ impl Standing {
             return Self::Run;
         }
         let has = |name: &str| names.iter().any(|own| own == name);
-        // A line is written after every iteration, before any later checkpoint.
+        // Every iteration writes a line before any later checkpoint.
         let untrained = fs::metadata(out.join("metrics.jsonl")).map_or(true, |file| file.len() == 0);
         let complete = has("summary.json") || has("weights.safetensors");
-        if has(crate::cli::CONFIG_FILE) && untrained && !complete { Self::Begun } else { Self::Other }
+        if has(CONFIG_FILE) && untrained && !complete { Self::Begun } else { Self::Other }
     }
 }
 
@@ -48,7 +51,7 @@ impl Standing {
 mod tests {
     use super::*;
 
-    fn standing(files: &[&str]) -> Standing {
+    fn state_of(files: &[&str]) -> RunFolderState {
         let folder = tempfile::tempdir().unwrap();
         for name in files {
             let path = folder.path().join(name.trim_end_matches('+'));
@@ -58,27 +61,27 @@ mod tests {
                 false => fs::write(&path, if name.ends_with('+') { "{}\n" } else { "" }).unwrap(),
             }
         }
-        Standing::of(folder.path())
+        RunFolderState::of(folder.path())
     }
 
     #[test]
-    fn only_what_was_never_trained_may_begin_again() {
-        assert_eq!(Standing::of(Path::new("/nowhere/at/all")), Standing::Empty);
-        let cases: [(&[&str], Standing); 10] = [
-            (&[], Standing::Empty),
-            (&["lost+found/"], Standing::Empty),
-            (&["config.toml"], Standing::Begun),
-            (&["config.toml+", "metrics.jsonl", "checkpoints/.000000.tmp/weights.safetensors"], Standing::Begun),
-            (&["config.toml", "metrics.jsonl", "checkpoints/000000/manifest.json"], Standing::Run),
-            // A checkpoint that cannot be read is for a person to look at.
-            (&["checkpoints/000005/"], Standing::Run),
-            (&["config.toml", "metrics.jsonl+"], Standing::Other),
-            (&["config.toml", "summary.json"], Standing::Other),
-            (&["config.toml", "weights.safetensors"], Standing::Other),
-            (&["thesis.doc"], Standing::Other),
+    fn only_an_untrained_run_may_begin_again() {
+        assert_eq!(RunFolderState::of(Path::new("/nowhere/at/all")), RunFolderState::Empty);
+        let cases: [(&[&str], RunFolderState); 10] = [
+            (&[], RunFolderState::Empty),
+            (&["lost+found/"], RunFolderState::Empty),
+            (&["config.toml"], RunFolderState::Begun),
+            (&["config.toml+", "metrics.jsonl", "checkpoints/.000000.tmp/weights.safetensors"], RunFolderState::Begun),
+            (&["config.toml", "metrics.jsonl", "checkpoints/000000/manifest.json"], RunFolderState::Run),
+            // An unreadable checkpoint needs an operator's decision.
+            (&["checkpoints/000005/"], RunFolderState::Run),
+            (&["config.toml", "metrics.jsonl+"], RunFolderState::Other),
+            (&["config.toml", "summary.json"], RunFolderState::Other),
+            (&["config.toml", "weights.safetensors"], RunFolderState::Other),
+            (&["thesis.doc"], RunFolderState::Other),
         ];
         for (files, expected) in cases {
-            assert_eq!(standing(files), expected, "{files:?}");
+            assert_eq!(state_of(files), expected, "{files:?}");
         }
     }
 }

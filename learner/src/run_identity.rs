@@ -1,14 +1,14 @@
-//! The identity of a run: what the handshake tells every peer.
+//! The identity of a run, as the handshake sends it to every peer.
 
 use magex_core::ids::RunId;
 use std::time::Duration;
 
-/// What every peer is told about the run.
+/// What the handshake says about the run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunIdentity {
     /// Identity of the run.
     pub run_id: RunId,
-    /// Name of the run, for people.
+    /// Display name of the run.
     pub name: String,
     /// Fingerprint of the run's task.
     pub task_fingerprint: String,
@@ -16,6 +16,6 @@ pub struct RunIdentity {
     pub run_config_toml: String,
     /// Seed of the run.
     pub seed: u64,
-    /// An actor that says nothing for so long loses its leases.
+    /// Silence after which an actor loses its leases.
     pub lease: Duration,
 }

@@ -1,87 +1,35 @@
-//! The training loop: publish → collect → update → checkpoint → again. It runs on a thread of its own and blocks on its
-//! [`Collector`]; it knows nothing of connections.
+//! The training loop: publish → plan → collect → evaluate → update → record → checkpoint. It runs on its own thread and blocks
+//! on its [`Collector`]; its [`RunObserver`]s follow it. It has no connections.
 
+mod outcome;
+mod plan;
 mod saving;
+
+pub use outcome::{TrainError, TrainOutcome};
+pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
 use crate::checkpoint::{self, CheckpointError, Learned, Progress, sha256_hex};
 use crate::collector::Collector;
-use crate::page::{LivePage, Phase};
+use crate::page::{Phase, RunEnd};
 use crate::report::metrics_file::{EvalSummary, IterationMetrics, MetricsFile, Summary, Timing, summarise};
+use crate::report::observer::{RunObserver, RunStart};
 use crate::report::tensorboard::EventFile;
-use crate::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use crate::run_events::{CollectError, IterationReport, RunEvent};
 use crate::train::batch::Batch;
-use crate::train::commander_ppo::CommanderPpo;
-use crate::train::mappo::Mappo;
+use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
+use crate::train::mappo::{Mappo, UpdateStats};
 use magex_core::config::RunConfig;
-use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::ids::{Iteration, Mode, RunId, Shard, WeightsVersion};
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
-use magex_nets::commander::CommanderError;
-use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Episodes of an evaluation shard.
-const EVAL_SHARD: u32 = 16;
-/// Evaluation set while training.
-pub const EVAL_SET_TRAINING: u32 = 1;
-/// Evaluation set that closes a run: other spawns than any set before.
-pub const EVAL_SET_FINAL: u32 = 2;
-
-/// Why training stopped with an error.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainError {
-    /// The plan could not be collected.
-    #[error(transparent)]
-    Collect(#[from] CollectError),
-    /// Reading or writing the run folder.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// Networks.
-    #[error(transparent)]
-    Weights(#[from] ParamError),
-    /// Commander.
-    #[error(transparent)]
-    Commander(#[from] CommanderError),
-    /// Files of the run folder.
-    #[error("{path}: {error}")]
-    Io {
-        /// Which.
-        path: PathBuf,
-        /// What the system said.
-        error: std::io::Error,
-    },
-    /// The run is done, and what it leaves behind cannot be written.
-    #[error(
-        "{path}: {error}, for {waited} s; make room or give the rights, then continue with --resume: only the end is done again"
-    )]
-    LastFiles {
-        /// Which.
-        path: PathBuf,
-        /// What the system said.
-        error: std::io::Error,
-        /// How long it was tried.
-        waited: u64,
-    },
-    /// A result that does not belong to the plan.
-    #[error("results: {0}")]
-    Result(String),
-    /// The run folder belongs to another configuration.
-    #[error("{0}")]
-    Configuration(String),
-}
-
-/// How a run ended.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Outcome {
-    /// Target reached or budget spent.
-    Finished(Box<Summary>),
-    /// Told to stop; the run resumes from its last checkpoint.
-    Stopped(StopReason),
-}
+/// Evaluations in a row that must reach the target.
+const EVALUATIONS_ON_TARGET: u32 = 2;
 
 /// One run.
 #[derive(Debug)]
@@ -94,15 +42,14 @@ pub struct Trainer {
     learned: Learned,
     progress: Progress,
     started: Instant,
-    metrics: MetricsFile,
-    events: EventFile,
-    page: Option<Arc<LivePage>>,
+    /// metrics.jsonl comes first: an iteration is on disk before it is reported anywhere else.
+    observers: Vec<Box<dyn RunObserver>>,
     pool: Arc<rayon::ThreadPool>,
-    /// A run that was complete when it was opened, and its summary as it is on disk.
+    /// The summary of a run that was complete when it was opened, parsed and as it is on disk.
     complete: Option<(Summary, String)>,
-    /// How a resumed run stood.
+    /// The last iteration of an earlier process.
     before: Option<IterationReport>,
-    /// Checkpoints in a row that could not be written.
+    /// Checkpoints that could not be written, in a row.
     failed_checkpoints: u32,
 }
 
@@ -110,14 +57,14 @@ impl Trainer {
     /// A new run in an existing, empty folder.
     pub fn create(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mut trainer = Self::prepare(config, run_id, folder, threads)?;
-        trainer.metrics = MetricsFile::create(folder)?;
-        trainer.events = EventFile::new(folder, None);
+        trainer.observe(MetricsFile::create(folder)?);
+        trainer.observe(EventFile::new(folder, None));
         trainer.checkpoint()?;
         Ok(trainer)
     }
 
-    /// A run that continues from its newest usable checkpoint. What was wrong with newer ones is returned. A run that is
-    /// complete stays as it is.
+    /// A run that continues from its newest usable checkpoint; the errors of newer ones are returned. A complete run is not
+    /// changed.
     pub fn resume(
         config: &RunConfig,
         folder: &Path,
@@ -126,19 +73,16 @@ impl Trainer {
         let mut trainer = Self::prepare(config, RunId(String::new()), folder, threads)?;
         let (progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
         if progress.config_sha256 != trainer.progress.config_sha256 {
-            return Err(TrainError::Configuration(format!(
-                "{}: the checkpoint was made with another configuration; resume without a configuration file, or start anew",
-                folder.display()
-            )));
+            return Err(TrainError::OtherConfiguration { folder: folder.to_owned() });
         }
         trainer.run_id = RunId(progress.run_id.clone());
         checkpoint::clean(folder);
         trainer.complete = summary_of(folder, progress.iteration, &learned)?;
         if trainer.complete.is_none() {
-            trainer.metrics = MetricsFile::reopen(folder, progress.iteration)?;
-            trainer.events = EventFile::new(folder, Some(progress.joint_env_steps));
+            trainer.observe(MetricsFile::reopen(folder, progress.iteration)?);
+            trainer.observe(EventFile::new(folder, Some(progress.joint_env_steps)));
         }
-        trainer.before = MetricsFile::last_line(folder).and_then(IterationReport::of);
+        trainer.before = MetricsFile::last_line(folder).and_then(IterationReport::parse);
         trainer.progress = progress;
         trainer.learned = learned;
         Ok((trainer, skipped))
@@ -153,8 +97,7 @@ impl Trainer {
             .num_threads(threads.max(1))
             .thread_name(|i| format!("magex-train-{i}"))
             .stack_size(64 << 20)
-            .build()
-            .map_err(|e| TrainError::Configuration(format!("training threads: {e}")))?;
+            .build()?;
         let progress = Progress {
             format: checkpoint::FORMAT,
             run_id: run_id.0.clone(),
@@ -175,9 +118,7 @@ impl Trainer {
             learned,
             progress,
             started: Instant::now(),
-            metrics: MetricsFile::none(),
-            events: EventFile::none(),
-            page: None,
+            observers: Vec::new(),
             pool: Arc::new(pool),
             complete: None,
             before: None,
@@ -195,245 +136,234 @@ impl Trainer {
         &self.learned
     }
 
-    /// Shows the run on a page, with what it wrote down before.
-    pub fn show(&mut self, page: Arc<LivePage>) {
-        page.begin(&self.run_id, &self.folder);
-        self.page = Some(page);
+    /// Adds an observer, after those that are there.
+    pub fn observe(&mut self, mut observer: impl RunObserver + 'static) {
+        observer.begin(RunStart { run_id: &self.run_id, folder: &self.folder, before: self.before.as_ref() });
+        self.observers.push(Box::new(observer));
     }
 
-    fn tell(&self, what: impl FnOnce(&LivePage)) {
-        if let Some(page) = &self.page {
-            what(page);
-        }
+    fn notify(&mut self, notify: impl FnMut(&mut Box<dyn RunObserver>)) {
+        self.observers.iter_mut().for_each(notify);
     }
 
-    /// Trains until the target is reached, the budget is spent, or somebody asks to stop.
-    pub fn run(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
+    fn event(&mut self, event: &RunEvent) {
+        self.notify(|observer| observer.event(event));
+    }
+
+    /// Trains until the target is reached, the budget is spent, or a stop is requested.
+    pub fn run(&mut self, collector: &mut dyn Collector) -> Result<TrainOutcome, TrainError> {
         let outcome = self.train(collector);
-        self.tell(|page| page.ended(&outcome));
+        let end = match &outcome {
+            Ok(TrainOutcome::Finished(summary)) => RunEnd::Finished(serde_json::to_value(summary).unwrap_or_default()),
+            Ok(TrainOutcome::Stopped(reason)) => RunEnd::Stopped(reason.to_string()),
+            Err(error) => RunEnd::Failed(error.to_string()),
+        };
+        self.notify(|observer| observer.end(&end));
         outcome
     }
 
-    fn train(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
-        if let Some(before) = self.before.take() {
-            collector.resumed(&before);
-        }
+    fn train(&mut self, collector: &mut dyn Collector) -> Result<TrainOutcome, TrainError> {
         if let Some((summary, line)) = self.complete.take() {
-            // Nothing is computed or written again; commanders and watchers that come late are served.
+            // Nothing is computed or written again; commanders and watchers that connect late are served.
             self.publish(collector)?;
-            collector.event(RunEvent::Finished { summary_json: line });
-            return Ok(Outcome::Finished(Box::new(summary)));
+            self.event(&RunEvent::Finished { summary_json: line });
+            return Ok(TrainOutcome::Finished(Box::new(summary)));
         }
-        let budget = self.config.max_iterations();
-        // Spent on the checkpoint after the line before.
+        // A checkpoint is written after the line of its iteration, so its time counts in the next line.
         let mut checkpoint_s = 0.0;
         loop {
             let iteration = self.progress.iteration;
-            // Ends with the iteration; leases, and what comes of them in other processes, are its children.
+            // Root span of the iteration; lease spans, including those in actors and commander, are its children.
             let _span = tracing::info_span!(target: trace::TARGET, parent: None, "iteration", iteration).entered();
+            let mut timing = Timing { checkpoint_s, ..Timing::default() };
+
             let clock = Instant::now();
             self.publish(collector)?;
-            let publish_s = clock.elapsed().as_secs_f64();
-            let evaluate = iteration.is_multiple_of(self.config.run.eval_every) || iteration >= budget;
-            let train = iteration < budget;
-            let mut timing = Timing { checkpoint_s, publish_s, ..Timing::default() };
+            timing.publish_s = clock.elapsed().as_secs_f64();
 
-            // Collect: evaluation of version k and training episodes under version k in one plan, so that no actor idles.
             let clock = Instant::now();
-            let mut plan = Vec::new();
-            if evaluate {
-                let episodes = self.config.run.eval_episodes;
-                // Somebody may look at it; no number depends on that.
-                plan.extend(self.evaluation(EVAL_SET_TRAINING, episodes, Mode::Greedy, self.page.is_some()));
-            }
-            if train {
-                plan.extend(self.training());
-            }
-            self.tell(|page| page.phase(if train { Phase::Collecting } else { Phase::Evaluating }));
+            let train = iteration < self.config.max_iterations();
+            let plan = self.plan(train);
+            self.notify(|observer| observer.phase(if train { Phase::Collecting } else { Phase::Evaluating }));
             let results = match collector.collect(plan) {
-                Err(CollectError::Stopped(reason)) => return self.stop(collector, reason),
+                Err(CollectError::Stopped(reason)) => {
+                    // The iteration was not collected; a resume repeats it from the last complete one.
+                    self.save();
+                    return Ok(TrainOutcome::Stopped(reason));
+                }
                 other => other?,
             };
             timing.collect_s = clock.elapsed().as_secs_f64();
             let (trajectories, outcomes) = split(results);
-            self.tell(|page| page.evaluated(&outcomes));
-            let evaluation = summarise(outcomes.iter().flat_map(|o| &o.metrics));
-            // Counted when the iteration is complete: whoever resumes before that evaluates again.
-            let on_target = match &evaluation {
-                Some(evaluation) if evaluation.means[SUCCESS_RATE] >= Some(self.config.run.target_success.into()) => {
-                    self.progress.on_target.saturating_add(1)
-                }
-                Some(_) => 0,
-                None => self.progress.on_target,
-            };
-            let target_reached = on_target >= 2;
+
+            let evaluation = self.evaluated(&outcomes);
+            let on_target = self.on_target(evaluation.as_ref());
+            let target_reached = on_target >= EVALUATIONS_ON_TARGET;
             if target_reached || !train {
                 self.record(collector, &[], evaluation, timing, None)?;
                 return self.finish(collector, target_reached);
             }
 
-            // Update.
-            self.tell(|page| page.phase(Phase::Training));
-            let clock = Instant::now();
-            let span = tracing::info_span!(target: trace::TARGET, "update").entered();
-            let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
-            let (mappo, learned, seed) = (&self.mappo, &mut self.learned, self.config.run.seed);
-            let stats = self.pool.install(|| {
-                let batch = Batch::new(seed, mappo.spec(), &trajectories);
-                mappo.update(&mut learned.executor, &batch, iteration, done.min(1.0))
-            })?;
-            timing.executor_s = clock.elapsed().as_secs_f64();
-            let clock = Instant::now();
-            let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
-            let commander = self.commander.update(&mut self.learned.commander, &trajectories, iteration, rate)?;
-            timing.commander_s = clock.elapsed().as_secs_f64();
-            drop(span);
-
+            let updates = self.update(&trajectories, &mut timing)?;
+            // Counted when the iteration is complete: a resume from before that point evaluates again.
             self.progress.on_target = on_target;
             self.progress.iteration += 1;
             self.progress.joint_env_steps += self.config.steps_per_iteration();
-            // The line comes before the checkpoint: a kill in between costs nothing, a resume cuts the line off again.
+
+            // The line precedes the checkpoint: after a kill in between, a resume truncates it and repeats the iteration.
             let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
-            self.record(collector, &episodes, evaluation, timing, Some((stats, commander)))?;
+            self.record(collector, &episodes, evaluation, timing, Some(updates))?;
+
             let clock = Instant::now();
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
             if due || stop.is_some() || collector.checkpoint_requested() {
-                self.save(collector);
+                self.save();
             }
             checkpoint_s = clock.elapsed().as_secs_f64();
             if let Some(reason) = stop {
-                return Ok(Outcome::Stopped(reason));
+                return Ok(TrainOutcome::Stopped(reason));
             }
         }
     }
 
-    fn publish(&self, collector: &mut dyn Collector) -> Result<(), TrainError> {
+    fn publish(&mut self, collector: &mut dyn Collector) -> Result<(), TrainError> {
         let bytes = self.learned.broadcast()?;
         let weights = Weights::new(self.run_id.clone(), WeightsVersion(self.progress.iteration), bytes.into());
-        self.tell(|page| page.published(&weights));
+        self.notify(|observer| observer.published(&weights));
         Ok(collector.publish(&Arc::new(weights))?)
     }
 
-    /// The iteration's training shards.
-    fn training(&self) -> impl Iterator<Item = Shard> + use<> {
-        let shards = self.config.collect.shards_per_iteration;
-        let (episodes, iteration) = (self.config.collect.episodes_per_iteration / shards, self.progress.iteration);
-        (0..shards).map(move |index| Shard {
-            kind: ShardKind::Train,
-            iteration: Iteration(iteration),
-            index,
-            episodes,
-            first_episode: index * episodes,
-            version: WeightsVersion(iteration),
-            mode: Mode::Sampled,
-            eval_set: 0,
-            record: false,
-        })
+    /// Evaluation of version k and training episodes under version k in one plan, so that no actor idles between them.
+    fn plan(&self, train: bool) -> Vec<Shard> {
+        let (run, iteration) = (&self.config.run, self.progress.iteration);
+        let mut shards = Vec::new();
+        if iteration.is_multiple_of(run.eval_every) || !train {
+            let record = self.observers.iter().any(|observer| observer.wants_recording());
+            shards.extend(plan::evaluation(iteration, EVAL_SET_TRAINING, run.eval_episodes, Mode::Greedy, record));
+        }
+        if train {
+            shards.extend(plan::training(&self.config, iteration));
+        }
+        shards
     }
 
-    /// Shards of an evaluation of the present version.
-    fn evaluation(&self, set: u32, episodes: u32, mode: Mode, record: bool) -> impl Iterator<Item = Shard> + use<> {
+    fn evaluated(&mut self, outcomes: &[EvalOutcome]) -> Option<EvalSummary> {
+        self.notify(|observer| observer.evaluated(outcomes));
+        summarise(outcomes.iter().flat_map(|o| &o.metrics))
+    }
+
+    /// Evaluations in a row that reached the target, with this one.
+    fn on_target(&self, evaluation: Option<&EvalSummary>) -> u32 {
+        match evaluation {
+            Some(evaluation) if evaluation.means[SUCCESS_RATE] >= Some(self.config.run.target_success.into()) => {
+                self.progress.on_target.saturating_add(1)
+            }
+            Some(_) => 0,
+            None => self.progress.on_target,
+        }
+    }
+
+    /// Updates the executor and the commander with the iteration's trajectories.
+    fn update(
+        &mut self,
+        trajectories: &[Trajectory],
+        timing: &mut Timing,
+    ) -> Result<(UpdateStats, CommanderStats), TrainError> {
+        self.notify(|observer| observer.phase(Phase::Training));
+        let _span = tracing::info_span!(target: trace::TARGET, "update").entered();
         let iteration = self.progress.iteration;
-        // The two final evaluations share spawns; their shards need different names.
-        let offset = if mode == Mode::Sampled { episodes.div_ceil(EVAL_SHARD) } else { 0 };
-        (0..episodes.div_ceil(EVAL_SHARD)).map(move |index| Shard {
-            kind: ShardKind::Eval,
-            iteration: Iteration(iteration),
-            index: index + offset,
-            episodes: EVAL_SHARD.min(episodes - index * EVAL_SHARD),
-            first_episode: index * EVAL_SHARD,
-            version: WeightsVersion(iteration),
-            mode,
-            eval_set: set,
-            record: record && index == 0,
-        })
+        let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
+        let clock = Instant::now();
+        let (mappo, learned, seed) = (&self.mappo, &mut self.learned, self.config.run.seed);
+        let stats = self.pool.install(|| {
+            let batch = Batch::new(seed, mappo.spec(), trajectories);
+            mappo.update(&mut learned.executor, &batch, iteration, done.min(1.0))
+        })?;
+        timing.executor_s = clock.elapsed().as_secs_f64();
+        let clock = Instant::now();
+        let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
+        let commander = self.commander.update(&mut self.learned.commander, trajectories, iteration, rate)?;
+        timing.commander_s = clock.elapsed().as_secs_f64();
+        Ok((stats, commander))
     }
 
-    /// One line of metrics.jsonl, shown to whoever watches.
+    /// Reports an iteration to all observers.
     fn record(
         &mut self,
-        collector: &mut dyn Collector,
+        collector: &dyn Collector,
         episodes: &[EpisodeMetrics],
         evaluation: Option<EvalSummary>,
         timing: Timing,
-        updates: Option<(crate::train::mappo::UpdateStats, crate::train::commander_ppo::CommanderStats)>,
+        updates: Option<(UpdateStats, CommanderStats)>,
     ) -> Result<(), TrainError> {
-        let wall_s = self.progress.wall_s + self.started.elapsed().as_secs_f64();
         let metrics = IterationMetrics::new(
             &self.config,
             &self.progress,
             summarise(episodes),
             evaluation,
-            timing.judged(collector.collected().as_ref()),
+            timing.attributed(collector.collected().as_ref()),
             updates,
-            wall_s,
+            self.wall_s(),
         );
-        let mut line = self.metrics.append(&metrics)?;
-        // It is kept for late watchers; the buffer it was written into is larger.
-        line.shrink_to_fit();
-        collector.measured(&metrics);
-        self.events.append(&line, metrics.joint_env_steps);
-        self.tell(|page| page.line(&line));
-        collector.event(RunEvent::Iteration(IterationReport {
+        let report = IterationReport {
             iteration: Iteration(metrics.iteration),
             joint_env_steps: metrics.joint_env_steps,
             success: metrics.episodes.get(SUCCESS_RATE).map(|x| x as f32),
             reward: metrics.episodes.get(REWARD).map(|x| x as f32),
-            metrics_json: line,
-        }));
+            metrics_json: serde_json::to_string(&metrics)?,
+        };
+        self.notify(|observer| observer.iteration(&metrics, &report));
         Ok(())
     }
 
-    /// The evaluation that closes a run, the last checkpoint, and the summary.
-    fn finish(&mut self, collector: &mut dyn Collector, target_reached: bool) -> Result<Outcome, TrainError> {
-        let wall_s = self.progress.wall_s + self.started.elapsed().as_secs_f64();
-        self.save(collector);
-        let episodes = self.config.run.final_episodes;
-        let mut plan: Vec<Shard> = self.evaluation(EVAL_SET_FINAL, episodes, Mode::Greedy, true).collect();
-        plan.extend(self.evaluation(EVAL_SET_FINAL, episodes, Mode::Sampled, false));
-        self.tell(|page| page.phase(Phase::Evaluating));
+    /// Seconds of training so far, over all processes of the run.
+    fn wall_s(&self) -> f64 {
+        self.progress.wall_s + self.started.elapsed().as_secs_f64()
+    }
+
+    /// The last checkpoint, the evaluation that closes the run, and the files that the run leaves.
+    fn finish(&mut self, collector: &mut dyn Collector, target_reached: bool) -> Result<TrainOutcome, TrainError> {
+        let wall_s = self.wall_s();
+        self.save();
+        let (iteration, episodes) = (self.progress.iteration, self.config.run.final_episodes);
+        let mut plan: Vec<Shard> = plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Greedy, true).collect();
+        plan.extend(plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Sampled, false));
+        self.notify(|observer| observer.phase(Phase::Evaluating));
         let results = match collector.collect(plan) {
-            Err(CollectError::Stopped(reason)) => return Ok(Outcome::Stopped(reason)),
+            Err(CollectError::Stopped(reason)) => return Ok(TrainOutcome::Stopped(reason)),
             other => other?,
         };
         let (_, outcomes) = split(results);
-        self.tell(|page| page.evaluated(&outcomes));
-        let of = |mode: Mode| {
+        self.notify(|observer| observer.evaluated(&outcomes));
+        let summary_of = |mode: Mode| {
             summarise(outcomes.iter().filter(|o| o.shard.mode == mode).flat_map(|o| &o.metrics))
-                .ok_or_else(|| TrainError::Result("the final evaluation came back empty".to_owned()))
+                .ok_or(TrainError::EmptyEvaluation)
         };
         let weights = self.learned.weights()?;
         let summary = Summary::new(
             &self.config,
             &self.progress,
-            &of(Mode::Greedy)?,
-            &of(Mode::Sampled)?,
+            &summary_of(Mode::Greedy)?,
+            &summary_of(Mode::Sampled)?,
             target_reached,
             wall_s,
             sha256_hex(&weights),
         );
         let recordings: Vec<&Recording> = outcomes.iter().filter_map(|o| o.recording.as_ref()).collect();
-        let line = String::from_utf8_lossy(&json(&summary)?).into_owned();
-        let recordings = json(&recordings)?;
-        // The summary comes last: who sees it sees everything.
+        let (line, recordings) = (serde_json::to_string(&summary)?, serde_json::to_vec(&recordings)?);
+        // The summary is written last: a reader that finds it finds the other files too.
         let files: [(&str, &[u8]); 3] =
             [("weights.safetensors", &weights), ("recordings.json", &recordings), ("summary.json", line.as_bytes())];
-        if let Some(reason) = self.write_at_last(collector, &files)? {
-            return Ok(Outcome::Stopped(reason));
+        if let Some(reason) = self.write_last_files(collector, &files)? {
+            return Ok(TrainOutcome::Stopped(reason));
         }
-        collector.event(RunEvent::Finished { summary_json: line });
-        Ok(Outcome::Finished(Box::new(summary)))
-    }
-
-    /// Stopped before the iteration was collected: the last completed iteration is what resumes.
-    fn stop(&mut self, collector: &mut dyn Collector, reason: StopReason) -> Result<Outcome, TrainError> {
-        self.save(collector);
-        Ok(Outcome::Stopped(reason))
+        self.event(&RunEvent::Finished { summary_json: line });
+        Ok(TrainOutcome::Finished(Box::new(summary)))
     }
 }
 
-/// The summary of a run that is complete: it is there, and about what the checkpoint holds.
+/// The summary of a complete run: summary.json exists and describes the weights of the checkpoint.
 fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option<(Summary, String)>, TrainError> {
     let Ok(line) = std::fs::read_to_string(folder.join("summary.json")) else { return Ok(None) };
     let Ok(summary) = serde_json::from_str::<Summary>(&line) else { return Ok(None) };
@@ -441,14 +371,9 @@ fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option
     Ok(same.then_some((summary, line)))
 }
 
-/// SHA-256 of everything that decides a run's numbers.
-pub fn config_sha256(config: &RunConfig) -> Result<String, TrainError> {
-    let text = config.to_toml().map_err(|e| TrainError::Configuration(e.to_string()))?;
-    Ok(sha256_hex(text.as_bytes()))
-}
-
-fn json<T: serde::Serialize>(value: &T) -> Result<Vec<u8>, TrainError> {
-    serde_json::to_vec(value).map_err(|e| TrainError::Result(e.to_string()))
+/// SHA-256 of everything that determines a run's numbers.
+fn config_sha256(config: &RunConfig) -> Result<String, TrainError> {
+    Ok(sha256_hex(config.to_toml()?.as_bytes()))
 }
 
 fn split(results: Vec<ShardResult>) -> (Vec<Trajectory>, Vec<EvalOutcome>) {

@@ -10,6 +10,7 @@ pub mod elements;
 pub mod goals;
 pub mod parts;
 pub mod weights;
+pub mod weights_watch;
 
 /// Generated from `proto/magex/v1`.
 #[allow(missing_docs, unreachable_pub, clippy::all)]

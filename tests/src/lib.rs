@@ -7,12 +7,12 @@ pub mod proxy;
 pub mod relay;
 pub mod sandbox;
 
-use magex::local::LocalCollector;
+use magex::local::{EventChannel, LocalCollector};
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_learner::run_events::RunEvent;
-use magex_learner::trainer::{Outcome, Trainer};
+use magex_learner::trainer::{TrainOutcome, Trainer};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -43,7 +43,7 @@ pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations:
 #[derive(Debug)]
 pub struct Ran {
     /// Finished or stopped.
-    pub outcome: Outcome,
+    pub outcome: TrainOutcome,
     /// Hash of actor, critic and commander.
     pub sha256: String,
     /// Hash of the goal commander alone.
@@ -61,12 +61,14 @@ pub fn train(config: &RunConfig, folder: &Path, actors: usize, threads: usize) -
 /// Drives a trainer to its end or until `stop` is set.
 pub fn drive(mut trainer: Trainer, config: &RunConfig, actors: usize, stop: &Arc<AtomicBool>) -> Ran {
     let (sender, receiver): (_, Receiver<RunEvent>) = channel();
-    let mut collector = LocalCollector::new(config, actors, sender, stop.clone());
+    trainer.observe(EventChannel(sender));
+    let mut collector = LocalCollector::new(config, actors, stop.clone());
     let outcome = trainer.run(&mut collector).expect("training");
-    drop(collector);
     let learned = trainer.learned();
     let sha256 = magex_learner::checkpoint::sha256_hex(&learned.weights().expect("weights"));
     let commander_sha256 = learned.commander.params.sha256();
+    // The channel ends with its sender.
+    drop(trainer);
     Ran { outcome, sha256, commander_sha256, events: receiver.iter().collect() }
 }
 

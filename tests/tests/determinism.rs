@@ -10,13 +10,16 @@ use magex_core::task::TaskName;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint;
 use magex_learner::collector::Collector;
-use magex_learner::report::metrics_file::Summary;
-use magex_learner::run_events::{CollectError, RunEvent, StopReason};
-use magex_learner::trainer::{EVAL_SET_TRAINING, Outcome, Trainer};
+use magex_learner::page::{Phase, RunEnd};
+use magex_learner::report::metrics_file::{IterationMetrics, Summary};
+use magex_learner::report::observer::{RunObserver, RunStart};
+use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use magex_learner::trainer::{EVAL_SET_TRAINING, TrainOutcome, Trainer};
 use magex_proto::weights::Weights;
 use magex_tests::{drive, small, small_task, train, updates};
-use std::sync::Arc;
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
 
 const KINDS: [ExecutorKind; 5] =
     [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Attention, ExecutorKind::Mlp, ExecutorKind::Local];
@@ -60,7 +63,7 @@ fn random_goals_reach_the_share_of_the_training_episodes_and_no_evaluation() {
     assigned.commander.random_assignment_fraction = 0.0;
     assert_ne!(hash(&config, 1, 1), hash(&assigned, 1, 1));
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
-    let Outcome::Finished(summary) = &ran.outcome else { panic!("not finished") };
+    let TrainOutcome::Finished(summary) = &ran.outcome else { panic!("not finished") };
     let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
     assert!(ratio < 1.2, "evaluations are not given random goals: {ratio}");
     let trained: Vec<f64> = updates(&ran.events).iter().filter_map(|l| l["sampled_cost_ratio"].as_f64()).collect();
@@ -84,15 +87,15 @@ fn a_stopped_and_resumed_run_ends_with_the_same_bits() {
         // A stop is obeyed at the end of an iteration: with the flag set from the start, each attempt does one.
         let stop = Arc::new(AtomicBool::new(true));
         let first = Trainer::create(&config, magex_core::ids::RunId("r".into()), folder.path(), 1).unwrap();
-        assert!(matches!(drive(first, &config, 1, &stop).outcome, Outcome::Stopped(_)));
+        assert!(matches!(drive(first, &config, 1, &stop).outcome, TrainOutcome::Stopped(_)));
         for _ in 0..2 {
             let (next, skipped) = Trainer::resume(&config, folder.path(), 2).unwrap();
             assert!(skipped.is_empty());
-            assert!(matches!(drive(next, &config, 2, &stop).outcome, Outcome::Stopped(_)));
+            assert!(matches!(drive(next, &config, 2, &stop).outcome, TrainOutcome::Stopped(_)));
         }
         let (last, _) = Trainer::resume(&config, folder.path(), 1).unwrap();
         let ended = drive(last, &config, 3, &Arc::new(AtomicBool::new(false)));
-        assert!(matches!(ended.outcome, Outcome::Finished(_)));
+        assert!(matches!(ended.outcome, TrainOutcome::Finished(_)));
         assert_eq!(ended.sha256, whole, "{kind}");
         let lines = std::fs::read_to_string(folder.path().join("metrics.jsonl")).unwrap();
         let iterations: Vec<u64> = lines
@@ -156,7 +159,7 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
             .commander
             .clone();
         let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
-        let Outcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
+        let TrainOutcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
         let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
         assert!(ratio >= 0.999, "{kind}: better than exact");
         if kind == CommanderKind::Exact {
@@ -174,7 +177,7 @@ fn it_learns() {
                 [task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'\n[executor]\nkind = 'local'\n";
     let config = RunConfig::from_toml(text).unwrap();
     let ran = train(&config, tempfile::tempdir().unwrap().path(), 2, 2);
-    let Outcome::Finished(summary) = ran.outcome else { panic!("not finished") };
+    let TrainOutcome::Finished(summary) = ran.outcome else { panic!("not finished") };
     assert!(summary.episodes.greedy[SUCCESS_RATE].unwrap() > 0.9, "{summary:?}");
 }
 
@@ -218,10 +221,6 @@ impl Collector for Interrupted {
         Ok(results)
     }
 
-    fn event(&mut self, event: RunEvent) {
-        self.inner.event(event);
-    }
-
     fn stop_requested(&self) -> Option<StopReason> {
         matches!(self.at, Interruption::Drain(plan) if plan <= self.plans).then(|| StopReason::Drain(String::new()))
     }
@@ -235,12 +234,12 @@ fn interrupted(
     at: Interruption,
 ) -> (Option<Summary>, u32) {
     let never = Arc::new(AtomicBool::new(false));
-    let inner = LocalCollector::new(config, 1, std::sync::mpsc::channel().0, never);
+    let inner = LocalCollector::new(config, 1, never);
     let mut collector = Interrupted { inner, reached, at, plans: 0 };
     match trainer.run(&mut collector).unwrap() {
         // The only number that a clock may reach.
-        Outcome::Finished(summary) => (Some(Summary { wall_s: 0.0, ..*summary }), collector.plans),
-        Outcome::Stopped(_) => (None, collector.plans),
+        TrainOutcome::Finished(summary) => (Some(Summary { wall_s: 0.0, ..*summary }), collector.plans),
+        TrainOutcome::Stopped(_) => (None, collector.plans),
     }
 }
 
@@ -271,4 +270,76 @@ fn a_run_that_is_interrupted_anywhere_comes_to_what_an_undisturbed_one_comes_to(
             assert_eq!(summary, expected, "{reached:?} interrupted at {at:?}");
         }
     }
+}
+
+/// Records the calls it receives, and whether the line of an iteration is on disk when it is reported.
+#[derive(Debug, Default)]
+struct Witness {
+    folder: PathBuf,
+    calls: Arc<Mutex<Vec<String>>>,
+}
+
+impl Witness {
+    fn call(&self, call: impl Into<String>) {
+        self.calls.lock().unwrap().push(call.into());
+    }
+}
+
+impl RunObserver for Witness {
+    fn begin(&mut self, start: RunStart<'_>) {
+        self.folder = start.folder.to_owned();
+        self.call("begin");
+    }
+
+    fn phase(&mut self, phase: Phase) {
+        self.call(format!("{phase:?}"));
+    }
+
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+        let lines = std::fs::read_to_string(self.folder.join("metrics.jsonl")).unwrap();
+        let written = lines.lines().next_back() == Some(&report.metrics_json);
+        self.call(format!("iteration {} {}", report.iteration, if written { "on disk" } else { "not on disk" }));
+    }
+
+    fn event(&mut self, event: &RunEvent) {
+        match event {
+            RunEvent::Checkpoint { iteration, .. } => self.call(format!("checkpoint {iteration}")),
+            RunEvent::Finished { .. } => self.call("finished"),
+            other => self.call(format!("{other:?}")),
+        }
+    }
+
+    fn end(&mut self, end: &RunEnd) {
+        self.call(if matches!(end, RunEnd::Finished(_)) { "end: finished" } else { "end" });
+    }
+}
+
+#[test]
+fn observers_follow_a_run_in_order_and_change_no_number() {
+    let config = small(ExecutorKind::Local, 5, 2);
+    let alone = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
+    let folder = tempfile::tempdir().unwrap();
+    let mut trainer = Trainer::create(&config, RunId("test".into()), folder.path(), 1).unwrap();
+    let witness = Witness::default();
+    let calls = witness.calls.clone();
+    trainer.observe(witness);
+    let observed = drive(trainer, &config, 1, &Arc::new(AtomicBool::new(false)));
+    assert_eq!(observed.sha256, alone.sha256);
+    let expected = [
+        "begin",
+        "Collecting",
+        "Training",
+        "iteration 1 on disk",
+        "Collecting",
+        "Training",
+        "iteration 2 on disk",
+        "checkpoint 2",
+        "Evaluating",
+        "iteration 2 on disk",
+        "checkpoint 2",
+        "Evaluating",
+        "finished",
+        "end: finished",
+    ];
+    assert_eq!(*calls.lock().unwrap(), expected);
 }

@@ -167,7 +167,7 @@ fn a_full_disk_ends_nothing_and_tears_no_line() {
     cluster.start_actor();
     cluster.wait_for_iteration(6);
     disk.fill();
-    for message in ["no checkpoint; the one before stands", "metrics.jsonl cannot be written"] {
+    for message in ["checkpoint failed; the previous one remains valid", "metrics.jsonl cannot be written"] {
         wait_until(message, || cluster.learner.log().contains(message));
     }
     // A kill now falls back to the checkpoint before.
@@ -175,11 +175,11 @@ fn a_full_disk_ends_nothing_and_tears_no_line() {
     disk.make_room();
     let kept = newest(&run);
     let said = |cluster: &Cluster, what: &str| cluster.learner.log().matches(what).count();
-    let before = said(&cluster, "no checkpoint; the one before stands");
+    let before = said(&cluster, "checkpoint failed; the previous one remains valid");
     cluster.resume_learner();
     wait_until("a checkpoint of its own", || newest(&run) > kept);
     disk.fill();
-    wait_until("a full disk", || said(&cluster, "no checkpoint; the one before stands") > before);
+    wait_until("a full disk", || said(&cluster, "checkpoint failed; the previous one remains valid") > before);
     disk.make_room();
     wait_until("checkpoints again", || cluster.learner.log().contains("checkpoints can be written again"));
     disk.fill();

@@ -119,5 +119,5 @@ fn a_scrape_is_the_catalogue_and_the_ledger_balances() {
         let line = line.unwrap_or_else(|| panic!("no ledger of {counted} in\n{log}"));
         assert!(line.contains("residual=0"), "{line}");
     }
-    assert!(log.contains("bound_by="), "{log}");
+    assert!(log.contains("bottleneck="), "{log}");
 }

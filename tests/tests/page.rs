@@ -300,7 +300,7 @@ fn a_run_that_is_looked_at_learns_the_same_bits() {
             address
         });
         let mut trainer = Trainer::create(&config, RunId("test".into()), folder.path(), 1).unwrap();
-        trainer.show(page);
+        trainer.observe(page);
         let shown = drive(trainer, &config, 1, &Arc::new(AtomicBool::new(false)));
         assert_eq!(shown.sha256, alone.sha256, "{name}");
         let address = address.to_string();

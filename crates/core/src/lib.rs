@@ -4,6 +4,7 @@
 //! The learner knows a task only by its [`task::TaskConfig`]; the physics lives in `magex-env`.
 
 pub mod config;
+pub mod error;
 pub mod ids;
 pub mod keys;
 pub mod metrics_table;

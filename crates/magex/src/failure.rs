@@ -34,7 +34,7 @@ pub(crate) fn code_of(error: &anyhow::Error) -> u8 {
         return exit::USAGE;
     }
     match error.downcast_ref::<TrainError>() {
-        Some(TrainError::Configuration(_)) => exit::USAGE,
+        Some(error) if error.is_usage() => exit::USAGE,
         _ => exit::FAILURE,
     }
 }

@@ -6,7 +6,9 @@ use magex_core::config::{CommanderKind, RunConfig};
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use magex_learner::collector::Collector;
-use magex_learner::run_events::{CollectError, RunEvent, StopReason};
+use magex_learner::report::metrics_file::IterationMetrics;
+use magex_learner::report::observer::RunObserver;
+use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
 use magex_nets::commander::Commander;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
@@ -60,10 +62,7 @@ impl Crew {
             }
         });
         let results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
-        results
-            .into_iter()
-            .map(|r| r.unwrap_or_else(|| Err(CollectError::Other("a rollout thread died".into()))))
-            .collect()
+        results.into_iter().map(|r| r.unwrap_or_else(|| Err(CollectError::RolloutThread))).collect()
     }
 }
 
@@ -89,42 +88,44 @@ pub struct LocalCollector {
     config: RunConfig,
     threads: usize,
     crew: Option<Crew>,
-    events: Sender<RunEvent>,
     stop: Arc<std::sync::atomic::AtomicBool>,
 }
 
 impl LocalCollector {
-    /// Events go to `events`; a set `stop` ends the run after the current iteration.
-    pub fn new(
-        config: &RunConfig,
-        threads: usize,
-        events: Sender<RunEvent>,
-        stop: Arc<std::sync::atomic::AtomicBool>,
-    ) -> Self {
-        Self { config: config.clone(), threads, crew: None, events, stop }
+    /// A set `stop` ends the run after the current iteration.
+    pub fn new(config: &RunConfig, threads: usize, stop: Arc<std::sync::atomic::AtomicBool>) -> Self {
+        Self { config: config.clone(), threads, crew: None, stop }
     }
 }
 
 impl Collector for LocalCollector {
     fn publish(&mut self, weights: &Arc<Weights>) -> Result<(), CollectError> {
-        let crew = Crew::new(&self.config, &weights.bytes, None).map_err(|e| CollectError::Other(e.to_string()))?;
-        self.crew = Some(crew);
+        self.crew = Some(Crew::new(&self.config, &weights.bytes, None)?);
         Ok(())
     }
 
     fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError> {
         match &self.crew {
             Some(crew) => crew.work_all(&plan, self.threads),
-            None => Err(CollectError::Other("no weights were published".into())),
+            None => Err(CollectError::NoWeights),
         }
-    }
-
-    fn event(&mut self, event: RunEvent) {
-        // Nobody has to watch.
-        let _ = self.events.send(event);
     }
 
     fn stop_requested(&self) -> Option<StopReason> {
         self.stop.load(Ordering::Relaxed).then_some(StopReason::Shutdown)
+    }
+}
+
+/// Sends the events of a run to another thread. Events after the receiver is gone are dropped.
+#[derive(Debug)]
+pub struct EventChannel(pub Sender<RunEvent>);
+
+impl RunObserver for EventChannel {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+        self.event(&RunEvent::Iteration(report.clone()));
+    }
+
+    fn event(&mut self, event: &RunEvent) {
+        let _ = self.0.send(event.clone());
     }
 }

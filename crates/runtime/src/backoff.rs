@@ -40,8 +40,8 @@ fn fraction() -> f64 {
     f64::from(RandomState::new().build_hasher().finish() as u32) / (f64::from(u32::MAX) + 1.0)
 }
 
-/// A number that no other process is likely to draw: names an incarnation, never a number of a run.
-pub fn incarnation() -> u64 {
+/// A number that no other process is likely to draw: names an random_id, never a number of a run.
+pub fn random_id() -> u64 {
     let mut hasher = RandomState::new().build_hasher();
     hasher.write_u32(std::process::id());
     hasher.finish()
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn incarnations_differ() {
-        assert_ne!(incarnation(), incarnation());
+    fn random_ids_differ() {
+        assert_ne!(random_id(), random_id());
     }
 }

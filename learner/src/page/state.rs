@@ -2,7 +2,6 @@
 
 use super::curve::Curve;
 use super::scene::Scene;
-use crate::trainer::{Outcome, TrainError};
 use axum::body::Bytes;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
@@ -39,6 +38,17 @@ pub enum Phase {
     Evaluating,
     /// Updating.
     Training,
+}
+
+/// How a run ended in this process.
+#[derive(Debug, Clone, PartialEq)]
+pub enum RunEnd {
+    /// Target reached or budget spent; with the content of `summary.json`.
+    Finished(Value),
+    /// Stopped before the end, with the reason; the run can be resumed.
+    Stopped(String),
+    /// Failed, with the error.
+    Failed(String),
 }
 
 /// What the page says about a run that does not change.
@@ -112,7 +122,7 @@ impl LivePage {
             "max_iterations": config.max_iterations(),
         });
         Self {
-            process: format!("{:016x}", magex_runtime::backoff::incarnation()),
+            process: format!("{:016x}", magex_runtime::backoff::random_id()),
             started: Instant::now(),
             info,
             task: words,
@@ -178,16 +188,16 @@ impl LivePage {
         self.change(|_| ());
     }
 
-    /// Says how the run ended, as far as this process goes.
-    pub(crate) fn ended(&self, outcome: &Result<Outcome, TrainError>) {
+    /// Shows how the run ended.
+    pub(crate) fn ended(&self, end: RunEnd) {
         self.change(|run| {
-            run.end = Some(match outcome {
-                Ok(Outcome::Finished(summary)) => {
-                    run.summary = serde_json::to_value(summary).unwrap_or_default();
+            run.end = Some(match end {
+                RunEnd::Finished(summary) => {
+                    run.summary = summary;
                     ("finished", None)
                 }
-                Ok(Outcome::Stopped(reason)) => ("stopped", Some(reason.to_string())),
-                Err(error) => ("failed", Some(error.to_string())),
+                RunEnd::Stopped(reason) => ("stopped", Some(reason)),
+                RunEnd::Failed(error) => ("failed", Some(error)),
             });
         });
     }

@@ -1,8 +1,6 @@
 //! The page over a real socket, as a browser would ask for it.
 
 use super::*;
-use crate::run_events::StopReason;
-use crate::trainer::Outcome;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::{EvalOutcome, Recording, Shape};
@@ -172,7 +170,7 @@ async fn the_end_is_told_at_once_to_whoever_waits() {
     let revision = json_of(address, "/api/run").await["revision"].as_u64().unwrap();
     let waiting = tokio::spawn(async move { json_of(address, &format!("/api/run?after={revision}")).await });
     tokio::time::sleep(Duration::from_millis(20)).await;
-    page.ended(&Ok(Outcome::Stopped(StopReason::Drain("test".into()))));
+    page.ended(RunEnd::Stopped("drain: test".into()));
     let run = waiting.await.unwrap();
     assert_eq!((&run["state"], &run["reason"]), (&json!("stopped"), &json!("drain: test")));
 }

@@ -1,12 +1,13 @@
-//! What a run writes down: one line per iteration in metrics.jsonl, and summary.json at its end. docs/metrics.md lists
-//! every field.
+//! The records of a run: one line per iteration in metrics.jsonl, and summary.json at its end. docs/metrics.md lists every
+//! field.
 
 use crate::checkpoint::Progress;
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::report::bottleneck::{Bound, Collected, judge};
+use crate::report::bottleneck::{Bottleneck, CollectTiming, attribute};
+use crate::report::observer::RunObserver;
+use crate::run_events::IterationReport;
 use crate::train::commander_ppo::CommanderStats;
 use crate::train::mappo::UpdateStats;
-use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_core::trajectory::EpisodeMetrics;
@@ -54,7 +55,7 @@ pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> 
 /// Where an iteration's wall time went, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Timing {
-    /// Making the weights known.
+    /// Publishing the weights.
     pub publish_s: f64,
     /// Waiting for the actors.
     pub collect_s: f64,
@@ -64,15 +65,15 @@ pub struct Timing {
     pub commander_s: f64,
     /// Writing checkpoints.
     pub checkpoint_s: f64,
-    /// What the iteration waited for.
-    pub bound: Bound,
+    /// The stage that took most of it.
+    pub bottleneck: Bottleneck,
 }
 
 impl Timing {
-    /// With the verdict on what it was spent on.
-    pub fn judged(self, collected: Option<&Collected>) -> Self {
+    /// With its bottleneck.
+    pub fn attributed(self, collected: Option<&CollectTiming>) -> Self {
         let learner_s = self.publish_s + self.executor_s + self.commander_s + self.checkpoint_s;
-        Self { bound: judge(learner_s, self.collect_s, collected), ..self }
+        Self { bottleneck: attribute(learner_s, self.collect_s, collected), ..self }
     }
 
     fn seconds(&self) -> f64 {
@@ -261,18 +262,23 @@ impl Summary {
     }
 }
 
-/// Lines that are kept for a disk that takes none; the oldest go first.
-const WAITING: usize = 4096;
+/// Limit of the lines kept while the file cannot be written; the oldest are dropped first.
+const MAX_WAITING: usize = 4096;
 
-/// metrics.jsonl of a run folder. What the disk does not take now waits until it does: neither a full disk nor a kill leaves
-/// half a line in the middle.
-#[derive(Debug)]
-pub struct MetricsFile {
-    file: Option<Lines>,
+/// A file of the run folder that cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+#[error("{path}: {error}")]
+pub struct FileError {
+    /// The file.
+    pub path: PathBuf,
+    /// The system's error.
+    pub error: std::io::Error,
 }
 
+/// metrics.jsonl of a run folder. Lines that cannot be written wait until they can: neither a full disk nor a kill leaves half
+/// a line in the middle.
 #[derive(Debug)]
-struct Lines {
+pub struct MetricsFile {
     path: PathBuf,
     /// Opened for appending.
     file: File,
@@ -282,23 +288,18 @@ struct Lines {
 }
 
 impl MetricsFile {
-    /// Writes nowhere.
-    pub fn none() -> Self {
-        Self { file: None }
-    }
-
     /// An empty file.
-    pub fn create(folder: &Path) -> Result<Self, TrainError> {
+    pub fn create(folder: &Path) -> Result<Self, FileError> {
         let path = folder.join("metrics.jsonl");
-        File::create(&path).map_err(|error| TrainError::Io { path: path.clone(), error })?;
+        File::create(&path).map_err(|error| FileError { path: path.clone(), error })?;
         Self::open(path)
     }
 
-    /// The file of a resumed run, cut back to the iterations that the checkpoint contains: the others will be done again,
-    /// with the same numbers.
-    pub fn reopen(folder: &Path, iteration: u32) -> Result<Self, TrainError> {
+    /// The file of a resumed run, truncated to the iterations that the checkpoint contains: the others will be repeated, with
+    /// the same numbers.
+    pub fn reopen(folder: &Path, iteration: u32) -> Result<Self, FileError> {
         let path = folder.join("metrics.jsonl");
-        let io = |error| TrainError::Io { path: path.clone(), error };
+        let io = |error| FileError { path: path.clone(), error };
         let bytes = std::fs::read(&path).or_else(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Ok(Vec::new()),
             _ => Err(io(e)),
@@ -313,7 +314,7 @@ impl MetricsFile {
             })
             .flat_map(|line| [line, "\n"])
             .collect();
-        // A disk without room must not keep a run from going on: what is cut off at the end needs none.
+        // Truncation works on a full disk, so a full disk does not keep a run from resuming.
         if bytes.starts_with(kept.as_bytes()) && path.exists() {
             let file = OpenOptions::new().write(true).open(&path).map_err(io)?;
             file.set_len(kept.len() as u64).map_err(io)?;
@@ -323,64 +324,22 @@ impl MetricsFile {
         Self::open(path)
     }
 
-    /// The last line of a run folder's file, if it has one: how the run stood.
+    /// The last line of a run folder's file, if it has one.
     pub fn last_line(folder: &Path) -> Option<String> {
         let text = std::fs::read_to_string(folder.join("metrics.jsonl")).ok()?;
         text.lines().next_back().map(str::to_owned)
     }
 
-    /// Returns once the lines that are written would survive a power cut. What the disk says about that it says again when a
-    /// checkpoint is written.
-    pub fn sync(&mut self) {
-        if let Some(lines) = &self.file
-            && let Err(error) = lines.file.sync_data()
-        {
-            tracing::debug!(%error, "metrics.jsonl cannot be made durable");
-        }
-    }
-
-    fn open(path: PathBuf) -> Result<Self, TrainError> {
+    fn open(path: PathBuf) -> Result<Self, FileError> {
         let opened = OpenOptions::new().append(true).open(&path).and_then(|file| Ok((file.metadata()?.len(), file)));
-        let (length, file) = opened.map_err(|error| TrainError::Io { path: path.clone(), error })?;
-        Ok(Self { file: Some(Lines { path, file, length, waiting: VecDeque::new() }) })
+        let (length, file) = opened.map_err(|error| FileError { path: path.clone(), error })?;
+        Ok(Self { path, file, length, waiting: VecDeque::new() })
     }
 
-    /// Appends a line and returns it. A disk that does not take it gets it with the next one.
-    pub fn append(&mut self, metrics: &IterationMetrics) -> Result<String, TrainError> {
-        let line = serde_json::to_string(metrics).map_err(|e| TrainError::Result(e.to_string()))?;
-        if let Some(lines) = &mut self.file {
-            let said = !lines.waiting.is_empty();
-            lines.waiting.push_back(format!("{line}\n"));
-            if lines.waiting.len() > WAITING {
-                lines.waiting.pop_front();
-            }
-            match lines.flush() {
-                Ok(()) if said => tracing::info!("metrics.jsonl can be written again"),
-                Ok(()) => {}
-                Err(error) if said => tracing::debug!(%error, "metrics.jsonl still cannot be written"),
-                Err(error) => tracing::error!(%error, "metrics.jsonl cannot be written; its lines wait until it can"),
-            }
-        }
-        Ok(line)
-    }
-
-    /// Writes what waits.
-    ///
-    /// # Errors
-    /// The disk still does not take it.
-    pub fn flush(&mut self) -> Result<(), TrainError> {
-        match &mut self.file {
-            Some(lines) => lines.flush().map_err(|error| TrainError::Io { path: lines.path.clone(), error }),
-            None => Ok(()),
-        }
-    }
-}
-
-impl Lines {
-    fn flush(&mut self) -> std::io::Result<()> {
+    fn write_waiting(&mut self) -> std::io::Result<()> {
         while let Some(line) = self.waiting.front() {
             if let Err(error) = self.file.write_all(line.as_bytes()) {
-                // Part of it may be there. Cutting off needs no room.
+                // A part of the line may be written. Truncation works on a full disk.
                 self.file.set_len(self.length)?;
                 return Err(error);
             }
@@ -388,6 +347,34 @@ impl Lines {
             self.waiting.pop_front();
         }
         Ok(())
+    }
+}
+
+impl RunObserver for MetricsFile {
+    /// Appends a line. If it cannot be written, it is written with the next one.
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+        let failed_before = !self.waiting.is_empty();
+        self.waiting.push_back(format!("{}\n", report.metrics_json));
+        if self.waiting.len() > MAX_WAITING {
+            self.waiting.pop_front();
+        }
+        match self.write_waiting() {
+            Ok(()) if failed_before => tracing::info!("metrics.jsonl can be written again"),
+            Ok(()) => {}
+            Err(error) if failed_before => tracing::debug!(%error, "metrics.jsonl still cannot be written"),
+            Err(error) => tracing::error!(%error, "metrics.jsonl cannot be written; its lines wait until it can"),
+        }
+    }
+
+    /// The lines written so far survive a power cut.
+    fn sync(&mut self) {
+        if let Err(error) = self.file.sync_data() {
+            tracing::debug!(%error, "metrics.jsonl cannot be made durable");
+        }
+    }
+
+    fn flush(&mut self) -> Result<(), FileError> {
+        self.write_waiting().map_err(|error| FileError { path: self.path.clone(), error })
     }
 }
 
@@ -425,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_resume_does_again_is_cut_off_where_it_lies() {
+    fn iterations_that_a_resume_repeats_are_truncated_in_place() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         let half = line(4)[..9].to_owned();
@@ -433,10 +420,10 @@ mod tests {
         let file = std::fs::metadata(&path).unwrap().ino();
         MetricsFile::reopen(folder.path(), 2).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
-        // No room was needed for that.
+        // The file was truncated, not replaced.
         assert_eq!(std::fs::metadata(&path).unwrap().ino(), file);
         assert_eq!(MetricsFile::last_line(folder.path()).unwrap(), line(2).trim_end());
-        // Something in the middle that is no line is cut out.
+        // An invalid line in the middle is removed.
         std::fs::write(&path, line(1) + "half\n" + &line(2)).unwrap();
         MetricsFile::reopen(folder.path(), 2).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));

@@ -1,11 +1,14 @@
-//! The numbers of metrics.jsonl once more, as TensorBoard reads them: `tensorboard/events.out.tfevents.NNNN` in the run folder.
+//! The numbers of metrics.jsonl in TensorBoard's format: `tensorboard/events.out.tfevents.NNNN` in the run folder.
 //!
-//! Each process of a run writes a file of its own. The file of a resumed run begins by saying from which step on it counts:
-//! TensorBoard then drops what earlier files say from there on, as metrics.jsonl drops those lines. Files are numbered, not
-//! named by the clock, because TensorBoard reads them in the order of their names.
+//! Each process of a run writes its own file. The file of a resumed run begins with the step from which it counts: TensorBoard
+//! then drops later steps of earlier files, as metrics.jsonl drops those lines. Files are numbered, not named by the clock,
+//! because TensorBoard reads them in the order of their names.
 //!
 //! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
 
+use crate::report::metrics_file::IterationMetrics;
+use crate::report::observer::RunObserver;
+use crate::run_events::IterationReport;
 use prost::Message;
 use serde_json::Value;
 use std::fs::{File, OpenOptions};
@@ -62,7 +65,7 @@ struct SessionLog {
     status: i32,
 }
 
-/// Writes event files. What goes wrong is logged once and ends the writing: training goes on.
+/// Writes event files. An error is logged once and ends the writing; training continues.
 #[derive(Debug)]
 pub struct EventFile {
     state: State,
@@ -70,25 +73,20 @@ pub struct EventFile {
 
 #[derive(Debug)]
 enum State {
-    /// Writes nowhere.
+    /// Nothing is written after an error.
     Off,
-    /// Nothing to write yet. A run that begins, or that continues behind so many steps.
+    /// No file yet: the folder, and the steps that a resumed run continues from.
     Waiting(PathBuf, Option<u64>),
     Open(File, PathBuf),
 }
 
 impl EventFile {
-    /// Writes nowhere.
-    pub fn none() -> Self {
-        Self { state: State::Off }
-    }
-
     /// In a run folder; `resumed` is the number of steps that the run continues from. The file appears with the first line.
     pub fn new(folder: &Path, resumed: Option<u64>) -> Self {
         Self { state: State::Waiting(folder.join(FOLDER), resumed) }
     }
 
-    /// Takes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
+    /// Writes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
     pub fn append(&mut self, line: &str, step: u64) {
         if let Err((path, error)) = self.write(line, step) {
             tracing::warn!(path = %path.display(), %error, "no more TensorBoard events will be written");
@@ -107,12 +105,18 @@ impl EventFile {
             scalars("", &line, &mut values);
         }
         let record = record(step, What::Summary(Summary { values }));
-        // In one piece: a reader that comes meanwhile finds whole records.
+        // One write, so that a concurrent reader finds whole records.
         file.write_all(&record).map_err(|error| (path.clone(), error))
     }
 }
 
-/// A new file behind all that are there, with what every file begins with.
+impl RunObserver for EventFile {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+        self.append(&report.metrics_json, report.joint_env_steps);
+    }
+}
+
+/// Creates the next file, with the records that every file begins with.
 fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
     std::fs::create_dir_all(folder)?;
     let number = |name: &str| name.strip_prefix(PREFIX)?.parse::<u32>().ok();
@@ -134,7 +138,7 @@ fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
     Ok((file, path))
 }
 
-/// The numbers of an object: those at its top under `run/`, the others under the name of their object.
+/// The numbers of an object: those at the top level under `run/`, the others under the name of their object.
 fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
     let Value::Object(fields) = value else { return };
     for (name, value) in fields {

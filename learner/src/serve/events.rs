@@ -1,4 +1,4 @@
-//! What happened in the run so far, for whoever watches, however late.
+//! The latest events of the run, for watchers that may connect late.
 
 use crate::run_events::RunEvent;
 use magex_proto::v1;
@@ -10,11 +10,11 @@ use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// Events that are kept for late watchers. A line of metrics is some kilobytes: more would be a slow leak for the first hours
-/// of a run; metrics.jsonl has them all.
+/// Number of events kept for late watchers. A line of metrics has some kilobytes, so more would look like a leak in the first
+/// hours of a run; metrics.jsonl has all lines.
 const KEPT: usize = 256;
 
-/// Events that are copied at a time, so that the log is never locked for long.
+/// Number of events copied per lock, so that the log is locked only briefly.
 const BATCH: usize = 64;
 
 #[derive(Debug, Default)]
@@ -49,12 +49,12 @@ impl Events {
         self.count.send_replace(count);
     }
 
-    /// Events that are kept.
+    /// Number of events kept.
     pub(crate) fn len(&self) -> usize {
         lock(&self.log).events.len()
     }
 
-    /// Events from number `from` on, some at a time, with the number of the first.
+    /// At most [`BATCH`] events from number `from` on, with the number of the first.
     fn since(&self, from: u64) -> (u64, Vec<Arc<RunEvent>>) {
         let log = lock(&self.log);
         let start = from.max(log.first);
@@ -62,8 +62,8 @@ impl Events {
         (start, log.events.iter().skip(skip).take(BATCH).cloned().collect())
     }
 
-    /// Sends all kept events and follows; ends after the end of the run, when the learner closes, or with the reader, who has
-    /// left if nothing is taken for as long as `patience`.
+    /// Sends all kept events and then new ones. Ends with the run, when the learner closes, or when the reader disconnects or
+    /// reads nothing for `patience`.
     pub(crate) async fn stream(
         self: Arc<Self>,
         reader: mpsc::Sender<Result<v1::WatchRunResponse, Status>>,
@@ -92,7 +92,7 @@ impl Events {
                     Ok(()) if !finished => {}
                     Ok(()) | Err(mpsc::error::SendTimeoutError::Closed(_)) => return,
                     Err(mpsc::error::SendTimeoutError::Timeout(_)) => {
-                        tracing::warn!(?patience, "a watcher of the run reads nothing; its stream ends");
+                        tracing::warn!(?patience, "a watcher of the run reads nothing; ending its stream");
                         return;
                     }
                 }
@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_late_watcher_sees_all_that_is_kept_and_the_end() {
+    async fn a_late_watcher_receives_the_kept_events_and_the_end() {
         let events = Arc::new(Events::new());
         for i in 0..KEPT + 5 {
             events.push(RunEvent::Log(i.to_string()));
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_watcher_that_takes_nothing_is_let_go_of() {
+    async fn the_stream_of_a_watcher_that_reads_nothing_ends() {
         let events = Arc::new(Events::new());
         (0..9).for_each(|i| events.push(RunEvent::Log(i.to_string())));
         let (tx, mut rx) = mpsc::channel(4);

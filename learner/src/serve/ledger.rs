@@ -1,14 +1,16 @@
-//! Who works on what, and what became of it: a pure state machine without clock, threads or network.
+//! The shards of a plan, their leases and their results: a pure state machine without clock, threads or network.
 //!
-//! The learner opens a plan (the shards of an iteration); actors lease shards and complete them in any order and any number
-//! of times; the results come out in the order of the plan, each exactly once. Every lease ends in exactly one way, and so
-//! do the episodes of its shard: leased = trained + duplicate + expired + rejected + failed + outstanding.
+//! The learner opens a plan (the shards of an iteration). Actors lease shards and complete them in any order and any number
+//! of times. The results come out in the order of the plan, each exactly once. Every lease ends in exactly one way, and so do
+//! the episodes of its shard: leased = trained + duplicate + expired + rejected + failed + outstanding.
 
+use crate::run_events::PlanError;
+use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 
-/// Failures for good (not retryable) before which no shard is given up, and no actor is sent away for them.
+/// Permanent (not retryable) failures before a shard is given up or an actor is evicted.
 pub const MAX_FAILURES: u32 = 3;
 
 /// One connection of one actor.
@@ -19,7 +21,7 @@ pub struct SessionId(pub u64);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct LeaseId(pub u64);
 
-/// A shard handed out.
+/// A leased shard.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lease {
     /// Name of the lease.
@@ -28,38 +30,38 @@ pub struct Lease {
     pub shard: Shard,
 }
 
-/// What became of a result.
+/// The verdict on a result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Verdict {
     /// Taken into the batch.
     Accepted,
-    /// Done already, or of no open plan.
+    /// The shard is complete already, or belongs to no open plan.
     Duplicate,
-    /// Not usable; says why.
-    Rejected(String),
+    /// The result is invalid.
+    Rejected(FieldError),
 }
 
-/// What became of everything that was leased so far: of the shards, or of their episodes.
+/// Totals of the leases so far, by how they ended: of shards, or of their episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
-    /// Handed out, late results of forgotten leases included.
+    /// Leased, including late results of leases that the ledger no longer knows.
     pub leased: u64,
     /// Taken into a batch.
     pub trained: u64,
-    /// Dropped: done already, or of no open plan.
+    /// Dropped: complete already, or of no open plan.
     pub duplicate: u64,
     /// Lost with their actor.
     pub expired: u64,
-    /// Refused: the result was not usable.
+    /// Rejected: the result was invalid.
     pub rejected: u64,
-    /// Given back by the actor.
+    /// Returned by the actor without a result.
     pub failed: u64,
     /// Still held.
     pub outstanding: u64,
 }
 
 impl Counters {
-    /// What ended in no way or in two: always zero.
+    /// Leases that did not end in exactly one way: always zero.
     pub fn residual(&self) -> i128 {
         let ended = [self.trained, self.duplicate, self.expired, self.rejected, self.failed, self.outstanding];
         i128::from(self.leased) - ended.into_iter().map(i128::from).sum::<i128>()
@@ -86,14 +88,14 @@ enum Fate {
     Failed,
 }
 
-/// Shards and episodes, counted together so that neither can be forgotten.
+/// Totals of shards and of episodes, counted together so that neither can be forgotten.
 #[derive(Debug, Default)]
-struct Books {
+struct Totals {
     shards: Counters,
     episodes: Counters,
 }
 
-impl Books {
+impl Totals {
     fn leased(&mut self, episodes: u32) {
         self.shards.leased += 1;
         self.episodes.leased += u64::from(episodes);
@@ -105,45 +107,26 @@ impl Books {
     }
 }
 
-/// A plan that cannot be opened.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PlanError {
-    /// Nothing to do.
-    #[error("the plan has no shards")]
-    Empty,
-    /// The same shard twice.
-    #[error("the plan names shard {0} of iteration {1} twice")]
-    Repeated(u32, u32),
-    /// The one before is not complete.
-    #[error("a plan is open with {done} of {total} shards done")]
-    Open {
-        /// Shards done.
-        done: usize,
-        /// Shards of the plan.
-        total: usize,
-    },
-}
-
-/// A shard that no actor can do.
+/// A shard that fails at every actor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GivenUp {
-    /// Which.
+    /// The shard.
     pub shard: Shard,
-    /// What the last actor said.
+    /// The reason of the last failure.
     pub reason: String,
 }
 
-/// A failure for good: the actor says that it would meet it again.
+/// A permanent failure of a shard: the actor reports that a retry would fail too.
 #[derive(Debug, Clone, Copy)]
-pub struct Failure<'a> {
+pub struct ShardFailure<'a> {
     /// Name of the actor.
     pub actor: &'a str,
-    /// Number of its process.
+    /// Id of its process.
     pub process: u64,
-    /// What it said.
+    /// The reason it gave.
     pub reason: &'a str,
-    /// The processes of all actors that are connected.
-    pub present: &'a [u64],
+    /// The processes of all connected actors.
+    pub connected: &'a [u64],
 }
 
 #[derive(Debug)]
@@ -153,27 +136,26 @@ struct Slot {
     queued: bool,
     leases: u32,
     failures: u32,
-    /// Processes and names of the actors at which it failed for good.
+    /// Processes and names of the actors at which it failed permanently.
     failed_at: Vec<(u64, String)>,
 }
 
 impl Slot {
-    /// Notes a failure for good; whether it is the shard that is to blame. One actor's failures say nothing: as many
-    /// different ones must have met them, or everyone who is there. A process that is started anew under its old name is
-    /// the same actor.
-    fn fail(&mut self, failure: &Failure<'_>) -> bool {
-        let Failure { actor, process, present, .. } = *failure;
+    /// Records a permanent failure. Returns whether the shard is at fault rather than the actor: it failed at
+    /// [`MAX_FAILURES`] different actors, or at every connected one. A restarted process with the same name is the same actor.
+    fn fail(&mut self, failure: &ShardFailure<'_>) -> bool {
+        let ShardFailure { actor, process, connected, .. } = *failure;
         self.failures = self.failures.saturating_add(1);
-        self.failed_at.retain(|(other, name)| *other != process && (name != actor || present.contains(other)));
+        self.failed_at.retain(|(other, name)| *other != process && (name != actor || connected.contains(other)));
         self.failed_at.push((process, actor.to_owned()));
         let actors: BTreeSet<&str> = self.failed_at.iter().map(|(_, name)| name.as_str()).collect();
-        let everyone = present.iter().all(|here| self.failed_at.iter().any(|(process, _)| process == here));
-        actors.len() >= MAX_FAILURES as usize || (everyone && self.failures >= MAX_FAILURES)
+        let at_all = connected.iter().all(|other| self.failed_at.iter().any(|(process, _)| process == other));
+        actors.len() >= MAX_FAILURES as usize || (at_all && self.failures >= MAX_FAILURES)
     }
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Held {
+struct HeldLease {
     session: SessionId,
     shard: Shard,
 }
@@ -185,9 +167,9 @@ pub struct Ledger {
     plan: Vec<Slot>,
     position: HashMap<Shard, usize>,
     queue: VecDeque<usize>,
-    held: BTreeMap<LeaseId, Held>,
+    held: BTreeMap<LeaseId, HeldLease>,
     done: usize,
-    books: Books,
+    totals: Totals,
     given_up: Option<GivenUp>,
 }
 
@@ -201,7 +183,7 @@ impl Ledger {
             queue: VecDeque::new(),
             held: BTreeMap::new(),
             done: 0,
-            books: Books::default(),
+            totals: Totals::default(),
             given_up: None,
         }
     }
@@ -229,7 +211,7 @@ impl Ledger {
         Ok(())
     }
 
-    /// Hands out the next shard, if there is one to do.
+    /// Leases the next queued shard, if there is one.
     pub fn lease(&mut self, session: SessionId) -> Option<Lease> {
         loop {
             let at = self.queue.pop_front()?;
@@ -241,64 +223,64 @@ impl Ledger {
             slot.leases += 1;
             let id = LeaseId(self.next_lease);
             self.next_lease = self.next_lease.wrapping_add(1);
-            self.held.insert(id, Held { session, shard: slot.shard });
-            self.books.leased(slot.shard.episodes);
+            self.held.insert(id, HeldLease { session, shard: slot.shard });
+            self.totals.leased(slot.shard.episodes);
             return Some(Lease { id, shard: slot.shard });
         }
     }
 
-    /// Takes in a usable result. The result of a lease that is held no more (its actor had been given up, or the learner has
-    /// been restarted since) is as good as any: a shard's result does not depend on who computes it.
+    /// Accepts a valid result. A result whose lease has ended (its session was lost, or the learner restarted) counts too: a
+    /// shard's result does not depend on which actor computes it.
     pub fn complete(&mut self, session: SessionId, lease: LeaseId, result: ShardResult) -> Verdict {
         let shard = *result.shard();
         if self.held_by(session, lease).is_some_and(|held| held.shard != shard) {
             self.reject(session, lease);
-            return Verdict::Rejected("shard: not the one that was leased".to_owned());
+            return Verdict::Rejected(FieldError::new("shard", "not the one that was leased"));
         }
         if self.release(session, lease).is_none() {
-            self.books.leased(shard.episodes);
+            self.totals.leased(shard.episodes);
         }
         match self.position.get(&shard).map(|&at| &mut self.plan[at]) {
             Some(slot) if slot.result.is_none() => {
                 slot.result = Some(result);
                 self.done += 1;
-                self.books.ended(Fate::Trained, shard.episodes);
+                self.totals.ended(Fate::Trained, shard.episodes);
                 Verdict::Accepted
             }
             _ => {
-                self.books.ended(Fate::Duplicate, shard.episodes);
+                self.totals.ended(Fate::Duplicate, shard.episodes);
                 Verdict::Duplicate
             }
         }
     }
 
-    /// Notes that the result of a lease was not usable; the shard is to be done again, next.
+    /// Records an invalid result and queues the shard again, at the front.
     pub fn reject(&mut self, session: SessionId, lease: LeaseId) {
-        // Of a lease that is held no more nobody knows how many episodes it had: it has none.
+        // The shard of a lease that has ended is unknown, so it counts no episodes.
         let episodes = match self.release(session, lease) {
             Some(held) => {
                 self.requeue(held.shard, true);
                 held.shard.episodes
             }
             None => {
-                self.books.leased(0);
+                self.totals.leased(0);
                 0
             }
         };
-        self.books.ended(Fate::Rejected, episodes);
+        self.totals.ended(Fate::Rejected, episodes);
     }
 
-    /// Takes a lease back from an actor that cannot do it now; it comes after the others.
+    /// Returns a lease from an actor that cannot process it now; the shard is queued at the end.
     pub fn give_back(&mut self, session: SessionId, lease: LeaseId) {
         if let Some(held) = self.release(session, lease) {
-            self.books.ended(Fate::Failed, held.shard.episodes);
+            self.totals.ended(Fate::Failed, held.shard.episodes);
             self.requeue(held.shard, false);
         }
     }
 
-    /// Takes a lease back from an actor that could never do it; whether the actor held it. The shard is given up once it
-    /// failed so at [`MAX_FAILURES`] different actors, or that often and at every actor that is there.
-    pub fn fail(&mut self, session: SessionId, lease: LeaseId, failure: &Failure<'_>) -> bool {
+    /// Returns a lease that failed permanently; false if the session does not hold it. The shard is given up after failing at
+    /// [`MAX_FAILURES`] different actors, or that many times and at every connected actor.
+    pub fn fail(&mut self, session: SessionId, lease: LeaseId, failure: &ShardFailure<'_>) -> bool {
         let Some(shard) = self.held_by(session, lease).map(|held| held.shard) else { return false };
         if let Some(&at) = self.position.get(&shard) {
             let slot = &mut self.plan[at];
@@ -310,21 +292,21 @@ impl Ledger {
         true
     }
 
-    /// Takes back all leases of an actor that left or fell silent; they are the next to be handed out. How many there were.
+    /// Returns all leases of a session that ended to the front of the queue. Returns their number.
     pub fn drop_actor(&mut self, session: SessionId) -> usize {
-        let of_it: Vec<LeaseId> =
+        let leases: Vec<LeaseId> =
             self.held.iter().filter(|(_, held)| held.session == session).map(|(&id, _)| id).collect();
         // From the last to the first, so that the first is in front.
-        for &lease in of_it.iter().rev() {
+        for &lease in leases.iter().rev() {
             if let Some(held) = self.release(session, lease) {
-                self.books.ended(Fate::Expired, held.shard.episodes);
+                self.totals.ended(Fate::Expired, held.shard.episodes);
                 self.requeue(held.shard, true);
             }
         }
-        of_it.len()
+        leases.len()
     }
 
-    /// The results in the order of the plan, once all are in; the plan is closed.
+    /// Closes a complete plan and returns its results in the order of the plan.
     pub fn take(&mut self) -> Option<Vec<ShardResult>> {
         if !self.is_complete() {
             return None;
@@ -334,7 +316,7 @@ impl Ledger {
         Some(plan.into_iter().filter_map(|slot| slot.result).collect())
     }
 
-    /// Closes the plan without its results. Leases stay held until they end.
+    /// Closes the plan without results. Leases stay held until they end.
     pub fn abandon(&mut self) {
         self.plan.clear();
         self.close();
@@ -372,20 +354,20 @@ impl Ledger {
 
     /// What became of every lease so far.
     pub fn counters(&self) -> Counters {
-        Counters { outstanding: self.held.len() as u64, ..self.books.shards }
+        Counters { outstanding: self.held.len() as u64, ..self.totals.shards }
     }
 
     /// What became of the episodes of every lease so far.
     pub fn episodes(&self) -> Counters {
         let outstanding = self.held.values().map(|held| u64::from(held.shard.episodes)).sum();
-        Counters { outstanding, ..self.books.episodes }
+        Counters { outstanding, ..self.totals.episodes }
     }
 
-    fn held_by(&self, session: SessionId, lease: LeaseId) -> Option<&Held> {
+    fn held_by(&self, session: SessionId, lease: LeaseId) -> Option<&HeldLease> {
         self.held.get(&lease).filter(|held| held.session == session)
     }
 
-    fn release(&mut self, session: SessionId, lease: LeaseId) -> Option<Held> {
+    fn release(&mut self, session: SessionId, lease: LeaseId) -> Option<HeldLease> {
         self.held_by(session, lease)?;
         let held = self.held.remove(&lease)?;
         if let Some(&at) = self.position.get(&held.shard) {

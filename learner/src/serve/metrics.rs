@@ -1,6 +1,6 @@
-//! The learner's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
+//! The learner's Prometheus metrics, each declared once; docs/metrics.md describes them.
 
-use crate::report::bottleneck::BoundBy;
+use crate::report::bottleneck::{Bottleneck, Stage};
 use crate::report::metrics_file::IterationMetrics;
 use crate::serve::ledger;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
@@ -9,11 +9,11 @@ use magex_proto::v1::SubscriberRole;
 use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Held, Metrics, Seconds, SecondsBy};
 use std::time::Duration;
 
-/// Everything that the learner counts.
+/// The metrics of the learner.
 #[derive(Debug)]
-pub(crate) struct LearnerGauges {
-    shards: Fates,
-    episodes: Fates,
+pub(crate) struct LearnerMetrics {
+    shards: LeaseMetrics,
+    episodes: LeaseMetrics,
     pub(crate) received_bytes: Counter,
     joint_steps: Counter,
     agent_steps: Counter,
@@ -26,8 +26,8 @@ pub(crate) struct LearnerGauges {
     sample_age: Gauges,
     iterations: Counter,
     phase: SecondsBy,
-    bound: Counters,
-    bound_seconds: Gauges,
+    bottleneck: Counters,
+    bottleneck_seconds: Gauges,
     pub(crate) weights_version: Gauge,
     pub(crate) weights_bytes: Gauge,
     pub(crate) weights_published: Seconds,
@@ -40,29 +40,30 @@ pub(crate) struct LearnerGauges {
     reward: Gauge,
 }
 
-/// How a connection ended; the label of a metric.
+/// How a session ended; the label of a metric.
 pub(crate) const ENDS: [&str; 5] = ["left", "silent", "replaced", "closing", "refused"];
 /// Parts of an iteration; the label of a metric.
 const PHASES: [&str; 5] = ["publish", "collect", "executor", "commander", "checkpoint"];
 
-impl LearnerGauges {
-    /// Declares them.
+impl LearnerMetrics {
+    /// Declares all of them.
     pub(crate) fn new(m: &Metrics) -> Self {
-        let gauges = Self {
-            shards: Fates::new(m, "shards", "Shards"),
-            episodes: Fates::new(m, "episodes", "Episodes"),
-            received_bytes: m.counter("magex_learner_received_bytes_total", "Bytes of results that came in."),
-            joint_steps: m.counter("magex_learner_joint_steps_total", "Joint steps that came in to be trained on."),
-            agent_steps: m.counter("magex_learner_agent_steps_total", "Agent steps that came in to be trained on."),
+        let metrics = Self {
+            shards: LeaseMetrics::new(m, "shards", "Shards"),
+            episodes: LeaseMetrics::new(m, "episodes", "Episodes"),
+            received_bytes: m.counter("magex_learner_received_bytes_total", "Bytes of results received."),
+            joint_steps: m.counter("magex_learner_joint_steps_total", "Joint steps accepted into training batches."),
+            agent_steps: m.counter("magex_learner_agent_steps_total", "Agent steps accepted into training batches."),
             actors_live: m.gauge("magex_learner_actors_live", "Actors connected."),
-            actors_expected: m.gauge("magex_learner_actors_expected", "Actors connected, or lost lately and not back."),
+            actors_expected: m
+                .gauge("magex_learner_actors_expected", "Actors connected, or missing for less than ten minutes."),
             actor_threads: m.gauge("magex_learner_actor_threads", "Rollout threads of the actors connected."),
             sessions_ended: m.counters(
                 "magex_learner_sessions_ended_total",
                 "Connections of actors that ended.",
                 &["reason"],
             ),
-            queue: m.gauges("magex_learner_queue_messages", "What waits in the learner's queues.", &["queue"]),
+            queue: m.gauges("magex_learner_queue_messages", "Messages that wait in the learner's queues.", &["queue"]),
             policy_lag: m.gauges(
                 "magex_learner_policy_lag_versions",
                 "Newest version of the weights minus that of the samples of the latest batch.",
@@ -75,17 +76,21 @@ impl LearnerGauges {
             ),
             iterations: m.counter("magex_learner_iterations_total", "Iterations completed."),
             phase: m.seconds_by("magex_learner_phase_seconds", "Wall time of the parts of an iteration.", &["phase"]),
-            bound: m.counters("magex_learner_bound_iterations_total", "Iterations by what they waited for.", &["by"]),
-            bound_seconds: m.gauges(
-                "magex_learner_bound_seconds",
-                "Seconds of the latest iteration by what it waited for.",
-                &["by"],
+            bottleneck: m.counters(
+                "magex_learner_bottleneck_iterations_total",
+                "Iterations by the stage that took most of their time.",
+                &["stage"],
+            ),
+            bottleneck_seconds: m.gauges(
+                "magex_learner_bottleneck_seconds",
+                "Seconds of the latest iteration by stage.",
+                &["stage"],
             ),
             weights_version: m.gauge("magex_learner_weights_version", "Newest version of the weights."),
             weights_bytes: m.gauge("magex_learner_weights_bytes", "Size of the newest weights."),
             weights_published: m.seconds(
                 "magex_learner_weights_published_seconds",
-                "From publishing weights to having handed them to a subscriber's connection.",
+                "From publishing weights to handing them to a subscriber's connection.",
             ),
             subscribers: m.gauges("magex_learner_subscribers", "Subscribers of the weights.", &["role"]),
             checkpoint: m.seconds("magex_learner_checkpoint_seconds", "Writing a checkpoint."),
@@ -94,28 +99,28 @@ impl LearnerGauges {
                 .counter("magex_learner_checkpoint_failures_total", "Checkpoints that could not be written."),
             skipped: m.counter(
                 "magex_learner_skipped_updates_total",
-                "Minibatches whose gradient was not finite; they changed nothing.",
+                "Minibatches skipped because a loss or a gradient was not finite.",
             ),
             success: m.gauge("magex_learner_success_ratio", "Success rate of the latest evaluation."),
             reward: m
                 .gauge("magex_learner_reward_mean", "Mean reward per agent and step of the latest training episodes."),
         };
         // A scrape shows all of them from the start.
-        ENDS.iter().for_each(|reason| gauges.sessions_ended.with(&[reason]).add(0));
-        PHASES.iter().for_each(|phase| drop(gauges.phase.with(&[phase])));
-        for by in BoundBy::ALL {
-            gauges.bound.with(&[by.name()]).add(0);
-            gauges.bound_seconds.with(&[by.name()]).set(0.0);
+        ENDS.iter().for_each(|reason| metrics.sessions_ended.with(&[reason]).add(0));
+        PHASES.iter().for_each(|phase| drop(metrics.phase.with(&[phase])));
+        for stage in Stage::ALL {
+            metrics.bottleneck.with(&[stage.name()]).add(0);
+            metrics.bottleneck_seconds.with(&[stage.name()]).set(0.0);
         }
         for role in [SubscriberRole::Actor, SubscriberRole::Commander, SubscriberRole::Observer] {
-            gauges.subscribers.with(&[role_name(role)]).set(0.0);
+            metrics.subscribers.with(&[role_name(role)]).set(0.0);
         }
-        set_stats(&gauges.policy_lag, &[]);
-        set_stats(&gauges.sample_age, &[]);
-        gauges
+        set_stats(&metrics.policy_lag, &[]);
+        set_stats(&metrics.sample_age, &[]);
+        metrics
     }
 
-    /// How the ledger stands. Callers hold its lock.
+    /// Sets the metrics of the ledger. Called under its lock.
     pub(crate) fn ledger(&self, shards: &ledger::Counters, episodes: &ledger::Counters, queued: usize) {
         self.shards.set(shards);
         self.episodes.set(episodes);
@@ -134,7 +139,7 @@ impl LearnerGauges {
         self.subscribers.with(&[role_name(role)]).hold()
     }
 
-    /// A result with so many joint steps and agent steps was taken into the batch.
+    /// Counts the joint steps and agent steps of an accepted result.
     pub(crate) fn accepted(&self, (joint, agent): (u64, u64)) {
         self.joint_steps.add(joint);
         self.agent_steps.add(agent);
@@ -154,10 +159,10 @@ impl LearnerGauges {
         for (phase, seconds) in PHASES.iter().zip(spent) {
             self.phase.with(&[phase]).observe(Duration::from_secs_f64(seconds.max(0.0)));
         }
-        let bound = &timing.bound;
-        self.bound.with(&[bound.by.name()]).add(1);
-        for (by, seconds) in BoundBy::ALL.iter().zip([bound.actor_s, bound.learner_s, bound.network_s]) {
-            self.bound_seconds.with(&[by.name()]).set(seconds);
+        let Bottleneck { stage, actor_s, learner_s, network_s, .. } = timing.bottleneck;
+        self.bottleneck.with(&[stage.name()]).add(1);
+        for (stage, seconds) in Stage::ALL.iter().zip([actor_s, learner_s, network_s]) {
+            self.bottleneck_seconds.with(&[stage.name()]).set(seconds);
         }
         if let Some(update) = &metrics.executor {
             self.skipped.add(update.skipped as u64);
@@ -170,7 +175,7 @@ impl LearnerGauges {
         }
     }
 
-    /// A checkpoint was written, with so many bytes, or could not be.
+    /// A checkpoint of `bytes` was written, or could not be written.
     pub(crate) fn checkpoint(&self, took: Duration, bytes: Option<u64>) {
         self.checkpoint.observe(took);
         match bytes {
@@ -182,27 +187,27 @@ impl LearnerGauges {
 
 /// The conservation ledger, of shards or of episodes.
 #[derive(Debug)]
-struct Fates {
+struct LeaseMetrics {
     counters: [Counter; 6],
     outstanding: Gauge,
     residual: Gauge,
 }
 
-impl Fates {
-    fn new(m: &Metrics, noun: &str, people: &str) -> Self {
+impl LeaseMetrics {
+    fn new(m: &Metrics, noun: &str, title: &str) -> Self {
         let name = |what: &str| format!("magex_learner_{noun}_{what}");
-        let counter = |what: &str, help: &str| m.counter(&name(&format!("{what}_total")), &format!("{people} {help}."));
+        let counter = |what: &str, help: &str| m.counter(&name(&format!("{what}_total")), &format!("{title} {help}."));
         Self {
             counters: [
-                counter("leased", "handed out"),
-                counter("trained", "taken into a batch"),
-                counter("duplicate", "dropped: done already, or no longer wanted"),
-                counter("expired", "lost with their actor"),
-                counter("rejected", "refused: the result was not usable"),
-                counter("failed", "given back by the actor"),
+                counter("leased", "leased"),
+                counter("trained", "accepted into a batch"),
+                counter("duplicate", "dropped: complete already, or no longer needed"),
+                counter("expired", "lost with their session"),
+                counter("rejected", "rejected: the result was invalid"),
+                counter("failed", "returned by the actor without a result"),
             ],
-            outstanding: m.gauge(&name("outstanding"), &format!("{people} that are handed out now.")),
-            residual: m.gauge(&name("residual"), &format!("{people} that ended in no way or in two; always 0.")),
+            outstanding: m.gauge(&name("outstanding"), &format!("{title} leased now.")),
+            residual: m.gauge(&name("residual"), &format!("{title} that did not end in exactly one way; always 0.")),
         }
     }
 
@@ -214,7 +219,7 @@ impl Fates {
     }
 }
 
-/// Joint steps and agent steps that a result brings to train on.
+/// Joint steps and agent steps of a training result; zero of an evaluation.
 pub(crate) fn steps_of(result: &ShardResult) -> (u64, u64) {
     let ShardResult::Train(trajectory) = result else { return (0, 0) };
     let shape = &trajectory.shape;
@@ -230,7 +235,7 @@ fn role_name(role: SubscriberRole) -> &'static str {
     }
 }
 
-/// Smallest, mean and largest; zeros of nothing.
+/// Sets minimum, mean and maximum; zeros if there are no values.
 fn set_stats(gauges: &Gauges, values: &[f64]) {
     let count = values.len().max(1) as f64;
     let smallest = values.iter().copied().reduce(f64::min).unwrap_or(0.0);

@@ -1,8 +1,9 @@
-//! The learner's gRPC face, and how it is served.
+//! The learner's gRPC service, and its server.
 
 use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
+use crate::serve::observer::ServiceObserver;
 use crate::serve::session;
 use crate::serve::shared::Shared;
 use crate::serve::validate::Limits;
@@ -26,29 +27,29 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
-/// Time of a lease unless configured.
+/// Default time of a lease.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
 
-/// Methods that stay open.
+/// Streaming methods.
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
-/// What one caller, and everybody, may have in flight. All actors of a run may be one caller.
+/// Limits in flight, per caller and in total. All actors of a run may be one caller.
 const FLIGHTS: FlightLimits = FlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
 
-/// The learner's two ends: one for the network, one for the training thread.
+/// The two ends of the service: one for the network, one for the training thread.
 pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, GrpcCollector) {
     let shared = Arc::new(Shared::new(run, limits));
-    let watched = Arc::downgrade(&shared);
-    shared.metrics.before_scrape(move || {
-        if let Some(shared) = watched.upgrade() {
-            shared.look();
+    let weak = Arc::downgrade(&shared);
+    shared.registry.before_scrape(move || {
+        if let Some(shared) = weak.upgrade() {
+            shared.refresh_gauges();
         }
     });
     let security = Security::default();
     (LearnerHandle { shared: shared.clone(), security }, GrpcCollector::new(shared))
 }
 
-/// The network's end of the learner.
+/// The network's end of the service.
 #[derive(Debug, Clone)]
 pub struct LearnerHandle {
     shared: Arc<Shared>,
@@ -58,26 +59,26 @@ pub struct LearnerHandle {
 /// Why serving failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The certificates.
+    /// The certificates are invalid.
     #[error("tls: {0}")]
     Tls(#[from] TlsError),
-    /// The server.
+    /// The server failed.
     #[error("the learner's server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
-    /// The descriptors.
+    /// The descriptors are invalid.
     #[error("the learner's reflection service cannot be built: {0}")]
     Reflection(#[from] server::ReflectionError),
 }
 
 impl LearnerHandle {
-    /// Guards the port; without this anybody may do everything.
+    /// Sets the access rules of the port. Without them every caller may use every method.
     #[must_use]
     pub fn guarded(self, security: Security) -> Self {
         Self { security, ..self }
     }
 
-    /// Serves until `shutdown`. Then the trainer is told to stop, actors are told why, streams end, and the call returns
-    /// within [`server::GRACE`]. After the end of the run cancel `shutdown`: actors are told that the run is complete.
+    /// Serves until `shutdown`. Then the trainer stops, actors receive the reason, streams end, and the call returns within
+    /// [`server::GRACE`]. Cancel `shutdown` after the end of the run too: actors then receive that the run is complete.
     pub async fn serve(&self, incoming: Incoming, shutdown: CancellationToken) -> Result<(), ServeError> {
         let (health, health_service) = Health::new::<LearnerServiceServer<LearnerApi>>().await;
         let api = LearnerApi { shared: self.shared.clone() };
@@ -85,7 +86,7 @@ impl LearnerHandle {
         let connections = incoming.connections();
         let rules = Rules {
             access: self.security.access.clone(),
-            // Callers learn from the service itself that it stops, and why.
+            // The service itself rejects calls during a shutdown, with the reason.
             admission: Admission::new(FLIGHTS, CancellationToken::new()),
             streams: STREAMS,
             message_bytes: MAX_MESSAGE_BYTES,
@@ -105,8 +106,7 @@ impl LearnerHandle {
             }
             stopped.cancelled().await;
             health.set(false).await;
-            shared.stop(StopReason::Shutdown);
-            shared.closing.cancel();
+            shared.close();
         });
         let served = server::serve(router, incoming, shutdown, server::GRACE).await;
         stopping.abort();
@@ -114,29 +114,33 @@ impl LearnerHandle {
         Ok(served?)
     }
 
-    /// What the learner shows over plain HTTP.
+    /// Health and metrics over plain HTTP.
     pub fn routes(&self) -> Router {
-        http::routes(self.shared.metrics.clone())
+        http::routes(self.shared.registry.clone())
     }
 
-    /// How the run stands.
+    /// The status of the run.
     pub fn status(&self) -> v1::RunStatus {
-        self.shared.status()
+        self.shared.run_status()
     }
 
-    /// Returns once somebody has asked the learner to stop: a drain, or the shutdown.
-    pub async fn told(&self) {
-        self.shared.told().cancelled().await;
+    /// The observer through which the training thread reports to the service.
+    pub fn observer(&self) -> ServiceObserver {
+        ServiceObserver::new(self.shared.clone())
     }
 
-    /// Tells the trainer to stop at once and ends every stream.
+    /// Returns after the first request to stop: a drain or a shutdown.
+    pub async fn stop_signal(&self) {
+        self.shared.control.stop_signal.cancelled().await;
+    }
+
+    /// Stops the trainer at once and ends every stream.
     pub fn close(&self) {
-        self.shared.stop(StopReason::Shutdown);
-        self.shared.closing.cancel();
+        self.shared.close();
     }
 }
 
-/// Implements the contract on top of the shared state.
+/// The methods of the service, on top of the shared state.
 #[derive(Debug)]
 struct LearnerApi {
     shared: Arc<Shared>,
@@ -144,8 +148,8 @@ struct LearnerApi {
 
 impl LearnerApi {
     fn check_open(&self) -> Result<(), Status> {
-        if self.shared.closing.is_cancelled() {
-            return Err(status::unavailable("the learner stops", Duration::from_secs(1)));
+        if self.shared.control.closing.is_cancelled() {
+            return Err(status::unavailable("the learner is shutting down", Duration::from_secs(1)));
         }
         Ok(())
     }
@@ -155,7 +159,7 @@ impl LearnerApi {
 impl LearnerService for LearnerApi {
     type RolloutStream = ReceiverStream<Result<v1::RolloutResponse, Status>>;
 
-    // Answers before the first message has come: the actor's call returns only then.
+    // Answers before the first message arrives, because the actor's call returns only then.
     async fn rollout(
         &self,
         request: Request<Streaming<v1::RolloutRequest>>,
@@ -180,45 +184,45 @@ impl LearnerService for LearnerApi {
         let own = &self.shared.run.run_id;
         if !request.run_id.is_empty() && request.run_id != own.0 {
             return Err(status::failed_precondition(format!(
-                "run_id: subscriber insists on run '{}', learner serves run '{own}'; leave it empty to take any",
+                "run_id: subscriber requires run '{}', learner serves run '{own}'; leave it empty to accept any",
                 request.run_id
             )));
         }
-        let place = self.shared.watcher()?;
+        let permit = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(1);
         let board = self.shared.board.subscribe();
-        let (closing, toml) = (self.shared.closing.clone(), self.shared.run.run_config_toml.clone());
+        let (closing, toml) = (self.shared.control.closing.clone(), self.shared.run.run_config_toml.clone());
         let (shared, patience) = (self.shared.clone(), self.shared.lease_time());
-        let subscribed = shared.gauges.subscriber(request.role());
+        let subscribed = shared.metrics.subscriber(request.role());
         tokio::spawn(async move {
             let _subscribed = subscribed;
             let sent = |version| {
                 if let Some(since) = shared.board.since(version) {
-                    shared.gauges.weights_published.observe(since.elapsed());
+                    shared.metrics.weights_published.observe(since.elapsed());
                 }
             };
             closing.run_until_cancelled(weights_board::stream(board, toml, reader, patience, sent)).await;
-            drop(place);
+            drop(permit);
         });
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
     async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>, Status> {
         caller(&request, &[Role::Client])?;
-        Ok(Response::new(v1::GetRunResponse { run: Some(self.shared.status()) }))
+        Ok(Response::new(v1::GetRunResponse { run: Some(self.shared.run_status()) }))
     }
 
     type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse, Status>>;
 
     async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
         caller(&request, &[Role::Client])?;
-        let place = self.shared.watcher()?;
+        let permit = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(64);
-        let (events, closing) = (self.shared.events.clone(), self.shared.closing.clone());
+        let (events, closing) = (self.shared.events.clone(), self.shared.control.closing.clone());
         let sending = events.stream(reader, closing, self.shared.lease_time());
         tokio::spawn(async move {
             sending.await;
-            drop(place);
+            drop(permit);
         });
         Ok(Response::new(ReceiverStream::new(stream)))
     }
@@ -229,26 +233,26 @@ impl LearnerService for LearnerApi {
     ) -> Result<Response<v1::CheckpointResponse>, Status> {
         caller(&request, &[])?;
         self.check_open()?;
-        match self.shared.status().state() {
+        match self.shared.run_status().state() {
             v1::RunState::Finished => {
-                return Err(status::failed_precondition("the run is complete: all of it is on disk"));
+                return Err(status::failed_precondition("the run is complete and already on disk"));
             }
             v1::RunState::WaitingForActors => {
                 return Err(status::failed_precondition(
-                    "no actor is connected, so the iteration does not end, and no checkpoint is written; start actors, or \
-                     drain the learner, which writes one at once",
+                    "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain \
+                     the learner, which writes one at once",
                 ));
             }
-            _ => self.shared.request_checkpoint(),
+            _ => self.shared.control.request_checkpoint(),
         }
-        Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.current_iteration() }))
+        Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.status.current_iteration() }))
     }
 
     async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
         caller(&request, &[])?;
         let reason = request.into_inner().reason;
-        tracing::info!(reason, "asked to drain");
+        tracing::info!(reason, "drain requested");
         self.shared.stop(StopReason::Drain(reason));
-        Ok(Response::new(v1::DrainResponse { iteration: self.shared.current_iteration() }))
+        Ok(Response::new(v1::DrainResponse { iteration: self.shared.status.current_iteration() }))
     }
 }

@@ -1,14 +1,15 @@
-//! One connection of one actor: hands out leases as credit allows, takes in results, notices silence.
+//! One connection of one actor: grants leases as its credit allows, receives results, and ends when the actor is silent for
+//! the time of a lease. The actor's end is `session` of `magex-actor`.
 
+mod handshake;
 mod results;
 
-use crate::serve::ledger::{Lease, LeaseId, SessionId};
-use crate::serve::shared::{ActorEntry, Shared};
+use crate::serve::ledger::{LeaseId, SessionId};
+use crate::serve::shared::Shared;
 use magex_proto::parts::Assembler;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::{PROTOCOL_VERSION, v1};
-use magex_runtime::sync::lock;
 use magex_runtime::{status, trace};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,28 +20,28 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 use tracing::Span;
 
-/// What the learner says to an actor.
+/// Messages to an actor.
 pub(crate) type Outbound = mpsc::Sender<Result<v1::RolloutResponse, Status>>;
 
-/// Leases that an actor may hold, and credit that it may have beside them, whatever it claims.
+/// Limit of the leases that an actor may hold, and of its credit for more.
 const MAX_LEASES: usize = 1024;
 
-/// How a connection ends.
+/// Why a session ends.
 #[derive(Debug)]
-enum End {
-    /// The actor closed it, or the network did.
+enum SessionEnd {
+    /// The actor or the network closed the connection.
     Left,
-    /// The actor said nothing for the time of a lease.
+    /// The actor sent nothing for the time of a lease.
     Silent,
     /// The same process connected again.
     Replaced,
     /// The learner stops, or the run is complete.
     Closing,
-    /// The learner sends the actor away.
+    /// The actor broke the protocol or was evicted.
     Refused(Status),
 }
 
-impl End {
+impl SessionEnd {
     fn name(&self) -> &'static str {
         match self {
             Self::Left => "left",
@@ -56,107 +57,18 @@ impl End {
 pub(crate) async fn run(
     shared: Arc<Shared>,
     address: String,
-    mut inbound: Streaming<v1::RolloutRequest>,
+    inbound: Streaming<v1::RolloutRequest>,
     outbound: Outbound,
 ) {
-    let hello = tokio::select! {
-        () = shared.closing.cancelled() => return,
-        hello = tokio::time::timeout(shared.lease_time(), inbound.message()) => match hello {
-            Ok(Ok(Some(message))) => message,
-            Ok(Ok(None) | Err(_)) => return,
-            Err(_) => {
-                let _ = outbound.send(Err(Status::deadline_exceeded("hello: did not come"))).await;
-                return;
-            }
-        },
-    };
-    if shared.finished() {
-        let _ = outbound.send(Ok(run_is_complete())).await;
-        return;
+    if let Some((session, inbound)) = handshake::accept(shared, address, inbound, outbound).await {
+        session.serve(inbound).await;
     }
-    let session = match greet(&shared, address, hello, &outbound) {
-        Ok((session, hello)) => Session::new(shared, session, hello, outbound),
-        Err(refusal) => {
-            tracing::warn!(reason = refusal.message(), "refused an actor");
-            let _ = outbound.send(Err(refusal)).await;
-            return;
-        }
-    };
-    session.serve(inbound).await;
 }
 
-fn run_is_complete() -> v1::RolloutResponse {
-    let drain = v1::Drain { reason: "the run is complete".to_owned(), finished: true };
-    v1::RolloutResponse { message: Some(Response::Drain(drain)) }
-}
-
-/// Checks the actor's introduction and puts it on the list.
-fn greet(
-    shared: &Shared,
-    address: String,
-    first: v1::RolloutRequest,
-    outbound: &Outbound,
-) -> Result<((SessionId, CancellationToken), v1::Hello), Status> {
-    let Some(Request::Hello(hello)) = first.message else {
-        return Err(status::invalid_argument("hello", "must be the first message"));
-    };
-    if hello.protocol_version != PROTOCOL_VERSION {
-        return Err(status::failed_precondition(format!(
-            "protocol_version: actor speaks protocol {}, learner speaks protocol {PROTOCOL_VERSION}; use the same release on both sides",
-            hello.protocol_version
-        )));
-    }
-    let own = &shared.run.task_fingerprint;
-    if !hello.task_fingerprint.is_empty() && hello.task_fingerprint != *own {
-        return Err(status::failed_precondition(format!(
-            "task_fingerprint: actor insists on task {}, learner runs task {own}; start the actor with the run's \
-             configuration, or without one to take the learner's",
-            hello.task_fingerprint
-        )));
-    }
-    if shared.was_sent_away(hello.incarnation) {
-        return Err(status::failed_precondition(
-            "incarnation: this process was sent away, for its results or for having none; find out why, then start the \
-             actor anew",
-        ));
-    }
-    let mut actors = lock(&shared.actors);
-    for actor in actors.values().filter(|actor| actor.incarnation == hello.incarnation) {
-        actor.replaced.cancel();
-    }
-    let standing = actors.values().filter(|actor| !actor.replaced.is_cancelled()).count();
-    if standing >= shared.limits.max_actors {
-        let limit = shared.limits.max_actors;
-        return Err(status::resource_exhausted(
-            format!("actors: all {limit} places are taken"),
-            Duration::from_secs(5),
-        ));
-    }
-    let replaced = CancellationToken::new();
-    let id = SessionId(shared.next_session());
-    actors.insert(
-        id,
-        ActorEntry {
-            actor_id: hello.actor_id.clone(),
-            incarnation: hello.incarnation,
-            address,
-            threads: hello.threads,
-            shards_done: 0,
-            weights_version: None,
-            last_seen: Instant::now(),
-            replaced: replaced.clone(),
-            outbound: outbound.downgrade(),
-        },
-    );
-    drop(actors);
-    shared.found(&hello.actor_id);
-    Ok(((id, replaced), hello))
-}
-
-/// A lease that was handed out here.
-struct Handed {
+/// A lease that this session granted.
+struct GrantedLease {
     since: Instant,
-    /// From the lease to what became of its result.
+    /// From the grant to the verdict on its result.
     span: Span,
 }
 
@@ -164,21 +76,22 @@ struct Session {
     shared: Arc<Shared>,
     id: SessionId,
     actor_id: String,
-    incarnation: u64,
+    process_id: u64,
     replaced: CancellationToken,
     outbound: Outbound,
     credit: usize,
     assembler: Assembler,
-    /// Lease whose result is being put together.
+    /// Lease whose result is being assembled.
     assembling: Option<LeaseId>,
-    /// Leases that wait for a result.
-    handed: HashMap<LeaseId, Handed>,
+    /// Leases without a result.
+    granted: HashMap<LeaseId, GrantedLease>,
+    /// Invalid results.
     rejected: u32,
-    /// Shards in a row that it could never do.
+    /// Shards that failed for good, in a row.
     failed: u32,
-    /// Results that were damaged on their way.
+    /// Results that arrived damaged.
     damaged: u32,
-    last_heard: Instant,
+    last_seen: Instant,
 }
 
 impl Session {
@@ -190,97 +103,96 @@ impl Session {
     ) -> Self {
         tracing::info!(actor = hello.actor_id, threads = hello.threads, "actor joined");
         let assembler = Assembler::new(shared.limits.max_result_bytes());
-        let last_heard = Instant::now();
+        let last_seen = Instant::now();
         Self {
             shared,
             id,
             actor_id: hello.actor_id,
-            incarnation: hello.incarnation,
+            process_id: hello.process_id,
             replaced,
             outbound,
             credit: 0,
             assembler,
             assembling: None,
-            handed: HashMap::new(),
+            granted: HashMap::new(),
             rejected: 0,
             failed: 0,
             damaged: 0,
-            last_heard,
+            last_seen,
         }
     }
 
     async fn serve(mut self, inbound: Streaming<v1::RolloutRequest>) {
-        let end = self.talk(inbound).await;
-        let lost = self.shared.with_ledger(|ledger| ledger.drop_actor(self.id));
-        self.shared.left(self.id);
-        self.shared.gauges.session_ended(end.name());
-        if !matches!(end, End::Closing) {
-            self.shared.miss(&self.actor_id);
+        let end = self.run_loop(inbound).await;
+        let lost = self.shared.remove_session(self.id);
+        self.shared.metrics.session_ended(end.name());
+        if !matches!(end, SessionEnd::Closing) {
+            self.shared.roster.mark_missing(&self.actor_id);
         }
         let (actor, rejected) = (&self.actor_id, self.rejected);
         match end {
-            End::Left => tracing::info!(actor, lost, "actor left"),
-            End::Silent => {
-                tracing::warn!(actor, lost, rejected, "actor fell silent; its leases go to others");
+            SessionEnd::Left => tracing::info!(actor, lost, "actor left"),
+            SessionEnd::Silent => {
+                tracing::warn!(actor, lost, rejected, "actor fell silent; its leases return to the queue");
                 let problem =
-                    format!("nothing heard for {:?}; the leases are given to others", self.shared.lease_time());
+                    format!("no message for {:?}; the leases returned to the queue", self.shared.lease_time());
                 let _ = self.outbound.try_send(Err(Status::deadline_exceeded(problem)));
             }
-            End::Replaced => tracing::info!(actor, lost, "actor connected again"),
-            End::Closing if self.shared.finished() => {
-                let _ = self.outbound.try_send(Ok(run_is_complete()));
+            SessionEnd::Replaced => tracing::info!(actor, lost, "actor reconnected"),
+            SessionEnd::Closing if self.shared.status.finished() => {
+                let _ = self.outbound.try_send(Ok(handshake::run_is_complete()));
             }
-            End::Closing => {
-                let reason = self.shared.stop_requested().map_or_else(String::new, |reason| reason.to_string());
+            SessionEnd::Closing => {
+                let reason = self.shared.control.stop_requested().map_or_else(String::new, |reason| reason.to_string());
                 let drain = Response::Drain(v1::Drain { reason, finished: false });
                 let _ = self.outbound.try_send(Ok(v1::RolloutResponse { message: Some(drain) }));
             }
-            End::Refused(refusal) => {
-                tracing::warn!(actor, lost, reason = refusal.message(), "sent an actor away");
+            SessionEnd::Refused(refusal) => {
+                tracing::warn!(actor, lost, reason = refusal.message(), "ended an actor's session");
                 let _ = self.outbound.try_send(Err(refusal));
             }
         }
     }
 
-    async fn talk<S>(&mut self, mut inbound: S) -> End
+    async fn run_loop<S>(&mut self, mut inbound: S) -> SessionEnd
     where
         S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
     {
-        // Before the first look at the queue, so that nothing queued later goes unseen.
-        let mut work = self.shared.work();
-        let (closing, complete) = (self.shared.closing.clone(), self.shared.complete.clone());
+        // Subscribed before the first grant, so that shards queued after it wake this loop.
+        let mut wakeups = self.shared.work.lease_wakeups();
+        let (closing, complete) = (self.shared.control.closing.clone(), self.shared.control.complete.clone());
         let (replaced, outbound) = (self.replaced.clone(), self.outbound.clone());
-        if let Err(end) = self.say(self.welcome()).await {
+        if let Err(end) = self.send(self.welcome()).await {
             return end;
         }
         loop {
-            work.borrow_and_update();
-            if let Err(end) = self.hand_out().await {
+            wakeups.borrow_and_update();
+            if let Err(end) = self.grant_leases().await {
                 return end;
             }
-            let deadline = tokio::time::Instant::from_std(self.last_heard + self.shared.lease_time());
-            // In this order: who has said something is not silent, however late it is read.
+            let deadline = tokio::time::Instant::from_std(self.last_seen + self.shared.lease_time());
+            // In this order: a message that has arrived counts before the deadline, however late it is read.
             tokio::select! {
                 biased;
-                () = closing.cancelled() => return End::Closing,
-                () = complete.cancelled() => return End::Closing,
-                () = replaced.cancelled() => return End::Replaced,
+                () = closing.cancelled() => return SessionEnd::Closing,
+                () = complete.cancelled() => return SessionEnd::Closing,
+                () = replaced.cancelled() => return SessionEnd::Replaced,
                 message = inbound.next() => {
-                    self.heard();
-                    let heard = match message {
-                        Some(Ok(v1::RolloutRequest { message: Some(message) })) => self.hear(message).await,
-                        Some(Ok(_)) => Err(End::Refused(status::invalid_argument("message", "not set or unknown"))),
-                        None | Some(Err(_)) => Err(End::Left),
+                    self.mark_seen();
+                    let handled = match message {
+                        Some(Ok(v1::RolloutRequest { message: Some(message) })) => self.on_message(message).await,
+                        Some(Ok(_)) => Err(SessionEnd::Refused(status::invalid_argument("message", "not set or unknown"))),
+                        None | Some(Err(_)) => Err(SessionEnd::Left),
                     };
-                    if let Err(end) = heard {
+                    if let Err(end) = handled {
                         return end;
                     }
-                    // The time that a long result took here is not the actor's silence.
-                    self.heard();
+                    // The time spent on this message is not silence of the actor.
+                    self.mark_seen();
                 }
-                changed = work.changed(), if self.credit > 0 => if changed.is_err() { return End::Closing },
-                () = outbound.closed() => return End::Left,
-                () = tokio::time::sleep_until(deadline) => return End::Silent,
+                changed = wakeups.changed(), if self.credit > 0 => if changed.is_err() { return SessionEnd::Closing },
+                () = outbound.closed() => return SessionEnd::Left,
+                () = tokio::time::sleep_until(deadline) => return SessionEnd::Silent,
             }
         }
     }
@@ -297,54 +209,46 @@ impl Session {
         })
     }
 
-    fn heard(&mut self) {
-        self.last_heard = Instant::now();
-        if let Some(actor) = lock(&self.shared.actors).get_mut(&self.id) {
-            actor.last_seen = self.last_heard;
-        }
+    fn mark_seen(&mut self) {
+        self.last_seen = Instant::now();
+        self.shared.roster.mark_seen(self.id, self.last_seen);
     }
 
-    /// Says something; an actor that does not listen for the time of a lease is as good as gone.
-    async fn say(&self, message: Response) -> Result<(), End> {
+    /// Sends a message. An actor that reads nothing for the time of a lease counts as silent.
+    async fn send(&self, message: Response) -> Result<(), SessionEnd> {
         let message = Ok(v1::RolloutResponse { message: Some(message) });
         match self.outbound.send_timeout(message, self.shared.lease_time()).await {
             Ok(()) => Ok(()),
-            Err(mpsc::error::SendTimeoutError::Timeout(_)) => Err(End::Silent),
-            Err(mpsc::error::SendTimeoutError::Closed(_)) => Err(End::Left),
+            Err(mpsc::error::SendTimeoutError::Timeout(_)) => Err(SessionEnd::Silent),
+            Err(mpsc::error::SendTimeoutError::Closed(_)) => Err(SessionEnd::Left),
         }
     }
 
-    /// Leases out what there is, as far as the credit goes.
-    async fn hand_out(&mut self) -> Result<(), End> {
-        while self.credit > 0 && self.handed.len() < MAX_LEASES {
-            let Some(lease) = self.shared.with_ledger(|ledger| ledger.lease(self.id)) else { break };
+    /// Grants leases while there are shards and credit.
+    async fn grant_leases(&mut self) -> Result<(), SessionEnd> {
+        while self.credit > 0 && self.granted.len() < MAX_LEASES {
+            let Some(lease) = self.shared.work.with_ledger(|ledger| ledger.lease(self.id)) else { break };
             self.credit -= 1;
             let weights_sha256 = self.shared.board.sha256(lease.shard.version).unwrap_or_default();
-            let span = self.lease_span(&lease);
+            let span = self.shared.work.lease_span(&lease, &self.actor_id);
             let traceparent = trace::traceparent(&span);
-            self.handed.insert(lease.id, Handed { since: Instant::now(), span });
+            self.granted.insert(lease.id, GrantedLease { since: Instant::now(), span });
             let shard = Some((&lease.shard).into());
-            self.say(Response::Lease(v1::Lease { lease_id: lease.id.0, shard, weights_sha256, traceparent })).await?;
+            self.send(Response::Lease(v1::Lease { lease_id: lease.id.0, shard, weights_sha256, traceparent })).await?;
         }
         Ok(())
     }
 
-    fn lease_span(&self, lease: &Lease) -> Span {
-        let (iteration, index, actor) = (lease.shard.iteration.0, lease.shard.index, self.actor_id.as_str());
-        let parent = lock(&self.shared.trace);
-        tracing::info_span!(target: trace::TARGET, parent: &*parent, "lease", iteration, index, actor)
-    }
-
-    async fn hear(&mut self, message: Request) -> Result<(), End> {
+    async fn on_message(&mut self, message: Request) -> Result<(), SessionEnd> {
         match message {
-            Request::Hello(_) => Err(End::Refused(status::invalid_argument("hello", "said twice"))),
+            Request::Hello(_) => Err(SessionEnd::Refused(status::invalid_argument("hello", "must be sent once"))),
             Request::Ready(ready) => {
                 self.credit = self.credit.saturating_add(ready.credit as usize).min(MAX_LEASES);
                 Ok(())
             }
             Request::Heartbeat(_) => Ok(()),
-            Request::Failed(failed) => self.take_back(&failed),
-            Request::Part(part) => self.take_part(part).await,
+            Request::Failed(failed) => self.on_failed(&failed),
+            Request::Part(part) => self.on_part(part).await,
         }
     }
 }

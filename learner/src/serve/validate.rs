@@ -1,4 +1,4 @@
-//! The door: what a result must be like before the learner trains on it.
+//! Validation of results before the learner trains on them.
 
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard};
@@ -7,18 +7,18 @@ use magex_core::task::TaskConfig;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
 
-/// What results of a run look like, and how much of everything the learner takes on.
+/// The shapes of a run's results, and the limits of the service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Limits {
-    /// Sizes of a result's arrays; `episodes` is the most that a shard may have.
+    /// Sizes of a result's arrays; `episodes` is the limit per shard.
     pub shape: Shape,
     /// Choices of each action component.
     pub action_heads: Vec<usize>,
     /// Whether the task has each of [`METRICS`]; one that it does not have may be absent.
     pub metrics: [bool; METRICS.len()],
-    /// Actors connected at the same time.
+    /// Limit of connected actors.
     pub max_actors: usize,
-    /// Open streams of weights and of events, at the same time.
+    /// Limit of open streams of weights and events.
     pub max_watchers: usize,
 }
 
@@ -44,12 +44,12 @@ impl Limits {
     }
 }
 
-/// Decodes a result and checks everything that can be checked without knowing the plan: identity of the run, shapes, ranges,
-/// and that every number is one.
+/// Decodes a result and checks everything that does not depend on the plan: identity of the run, shapes, ranges, and that
+/// every number is finite.
 ///
 /// # Errors
-/// Names the field, and the place within it.
-pub fn admit(limits: &Limits, run_id: &RunId, bytes: Bytes) -> Result<Delivery, ConvertError> {
+/// Names the field and the index within it.
+pub fn validate(limits: &Limits, run_id: &RunId, bytes: Bytes) -> Result<Delivery, ConvertError> {
     let delivery = decode_result(bytes)?;
     if delivery.run_id != *run_id {
         let problem = format!("'{}' where '{run_id}' is expected", delivery.run_id);
@@ -85,7 +85,7 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
     check_metrics("trajectory.metrics", limits, &trajectory.metrics)
 }
 
-/// Every agent has goals of its own, in every stage.
+/// Checks that in every stage no two agents have the same goal.
 fn check_one_to_one(trajectory: &Trajectory) -> Result<(), ConvertError> {
     let shape = &trajectory.shape;
     let (n, k) = (shape.agents.max(1), shape.goals_per_agent.max(1));
@@ -108,7 +108,7 @@ fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError
     match (&outcome.recording, outcome.shard.record) {
         (Some(recording), true) => check_recording(limits, recording),
         (None, false) => Ok(()),
-        (Some(_), false) => Err(ConvertError::new("eval.recording", "not asked for")),
+        (Some(_), false) => Err(ConvertError::new("eval.recording", "not requested")),
         (None, true) => Err(ConvertError::missing("eval.recording")),
     }
 }
@@ -160,11 +160,6 @@ fn check_metrics(field: &str, limits: &Limits, episodes: &[EpisodeMetrics]) -> R
     Ok(())
 }
 
-/// What identifies a shard to a person.
-pub(crate) fn describe(shard: &Shard) -> String {
-    format!("{:?} shard {} of iteration {}", shard.kind, shard.index, shard.iteration).to_lowercase()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -178,11 +173,11 @@ mod tests {
 
     fn verdict(result: ShardResult) -> Result<Delivery, String> {
         let run = RunId("r".into());
-        admit(&limits(), &run, encode_result(&run, "sha", &result)).map_err(|error| error.to_string())
+        validate(&limits(), &run, encode_result(&run, "sha", &result)).map_err(|error| error.to_string())
     }
 
     #[test]
-    fn what_the_task_makes_is_admitted_and_fits_the_byte_limit() {
+    fn a_result_of_the_task_is_valid_and_fits_the_byte_limit() {
         let result = ShardResult::Train(trajectory(&task(), train_shard(0, 0, 4)));
         let run = RunId("r".into());
         assert!(encode_result(&run, "sha", &result).len() <= limits().max_result_bytes());
@@ -192,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn garbage_is_named_and_refused() {
+    fn an_invalid_value_is_rejected_with_its_field() {
         let check = |damage: fn(&mut Trajectory), words: &str| {
             let mut bad = trajectory(&task(), train_shard(0, 0, 2));
             damage(&mut bad);
@@ -211,11 +206,11 @@ mod tests {
         check(|t| t.shard.episodes = 1, "trajectory.shape: ");
         let other =
             encode_result(&RunId("other".into()), "", &ShardResult::Train(trajectory(&task(), train_shard(0, 0, 1))));
-        assert!(admit(&limits(), &RunId("r".into()), other).unwrap_err().to_string().contains("'other' where 'r'"));
+        assert!(validate(&limits(), &RunId("r".into()), other).unwrap_err().to_string().contains("'other' where 'r'"));
     }
 
     #[test]
-    fn a_recording_comes_when_and_only_when_asked_for() {
+    fn a_recording_is_required_if_and_only_if_it_was_requested() {
         let mut shard = train_shard(0, 0, 2);
         let outcome = eval_outcome(&task(), shard, false);
         assert!(verdict(ShardResult::Eval(outcome)).is_ok());

@@ -1,4 +1,4 @@
-//! Publication of the weights: immutable versions, the latest two kept, slow subscribers skip.
+//! Publication of the weights: immutable versions, of which the latest two are kept; slow subscribers skip versions.
 
 use magex_core::ids::WeightsVersion;
 use magex_proto::v1::WatchWeightsResponse;
@@ -11,29 +11,29 @@ use tonic::Status;
 
 use magex_runtime::sync::lock;
 
-/// Versions that are kept: with a policy lag of 1 shards name the version before the latest.
+/// Number of versions kept: with a policy lag of 1 shards name the version before the latest.
 const KEPT: usize = 2;
 
-/// Hashes that are remembered, so that a late result can still be checked.
+/// Number of hashes remembered, so that late results can be checked.
 const REMEMBERED: usize = 64;
 
 type Snapshot = Arc<Vec<Arc<Weights>>>;
 
-/// Where the trainer pins up what it made and subscribers read it.
+/// The trainer publishes versions here; subscribers follow them.
 #[derive(Debug)]
-pub(crate) struct Board {
+pub(crate) struct WeightsBoard {
     /// The latest versions, newest last.
     kept: watch::Sender<Snapshot>,
     /// Their hashes, and when they were published.
     published: Mutex<BTreeMap<WeightsVersion, (String, Instant)>>,
 }
 
-impl Board {
+impl WeightsBoard {
     pub(crate) fn new() -> Self {
         Self { kept: watch::Sender::new(Snapshot::default()), published: Mutex::default() }
     }
 
-    /// Makes a version the latest. One that is not newer than the latest begins anew (a learner that went back).
+    /// Makes a version the latest and drops versions that are not older (the learner went back to an earlier checkpoint).
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
         {
             let mut published = lock(&self.published);
@@ -57,11 +57,11 @@ impl Board {
 
     /// Returns once there is a version.
     pub(crate) async fn first(&self) {
-        // The sender is ours: waiting cannot fail.
+        // This struct owns the sender, so the wait cannot fail.
         let _ = self.kept.subscribe().wait_for(|kept| !kept.is_empty()).await.map(drop);
     }
 
-    /// A version that can still be had.
+    /// Whether a version is kept.
     pub(crate) fn is_kept(&self, version: WeightsVersion) -> bool {
         self.kept.borrow().iter().any(|weights| weights.version == version)
     }
@@ -80,9 +80,9 @@ impl Board {
     }
 }
 
-/// Sends what is kept and then every newer version, each whole, until the reader leaves or takes nothing for as long as
-/// `patience`. Versions that are replaced while the reader is slow are never sent. `sent_newer` is told of every version that
-/// the reader was waiting for.
+/// Sends the kept versions and then every newer one, each whole, until the reader disconnects or reads nothing for
+/// `patience`. A slow reader skips versions that were replaced in the meantime. `sent_newer` is called after every version
+/// that the reader had been waiting for.
 pub(crate) async fn stream(
     mut board: watch::Receiver<Snapshot>,
     run_config_toml: String,
@@ -103,7 +103,7 @@ pub(crate) async fn stream(
                         Ok(()) => {}
                         Err(mpsc::error::SendTimeoutError::Closed(_)) => return,
                         Err(mpsc::error::SendTimeoutError::Timeout(_)) => {
-                            tracing::warn!(?patience, "a subscriber of the weights reads nothing; its stream ends");
+                            tracing::warn!(?patience, "a subscriber of the weights reads nothing; ending its stream");
                             return;
                         }
                     }
@@ -143,8 +143,8 @@ mod tests {
         Arc::new(Weights::new(RunId("r".into()), WeightsVersion(version), bytes))
     }
 
-    fn published(versions: impl IntoIterator<Item = u32>) -> Board {
-        let board = Board::new();
+    fn published(versions: impl IntoIterator<Item = u32>) -> WeightsBoard {
+        let board = WeightsBoard::new();
         versions.into_iter().for_each(|version| board.publish(weights(version)));
         board
     }
@@ -176,10 +176,10 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_reader_that_takes_nothing_is_let_go_of() {
+    async fn the_stream_of_a_reader_that_reads_nothing_ends() {
         let board = published([1, 2]);
         let (tx, mut rx) = mpsc::channel(1);
-        // The second version finds no room.
+        // The channel has no room for the second version.
         stream(board.subscribe(), String::new(), tx, Duration::from_millis(20), |_| ()).await;
         assert_eq!(rx.recv().await.unwrap().unwrap().version, 1);
         assert!(rx.recv().await.is_none());

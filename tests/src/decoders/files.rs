@@ -7,7 +7,7 @@ use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint::{self, Learned, Progress, sha256_hex};
-use magex_learner::serve::validate::{Limits, admit};
+use magex_learner::serve::validate::{Limits, validate};
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
@@ -59,7 +59,7 @@ impl Run {
 
     /// A result at the learner's door: what gets in is whole and finite.
     pub fn admit(&self, bytes: &[u8]) {
-        match admit(&self.limits, &RunId("r".into()), Bytes::copy_from_slice(bytes)) {
+        match validate(&self.limits, &RunId("r".into()), Bytes::copy_from_slice(bytes)) {
             Ok(delivery) => {
                 if let ShardResult::Train(trajectory) = &delivery.result {
                     assert_eq!(trajectory.validate(), Ok(()));

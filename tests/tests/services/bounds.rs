@@ -1,4 +1,4 @@
-//! What the learner does when there is too much of something, or a peer never reads.
+//! The learner's limits, and clients that never read.
 
 use crate::sandbox::*;
 use bytes::Bytes;
@@ -7,6 +7,7 @@ use magex_actor::worker::{MakeWorker, WorkError, Worker};
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use magex_core::trajectory::ShardResult;
 use magex_learner::collector::Collector as _;
+use magex_learner::report::observer::RunObserver as _;
 use magex_learner::run_events::RunEvent;
 use magex_proto::v1;
 use magex_proto::v1::rollout_response::Message as Response;
@@ -23,10 +24,10 @@ async fn fifty_actors_at_two_places_are_all_answered_at_once() {
     let learner = Learner::start_with(LearnerOptions { max_actors: 2, ..LearnerOptions::default() }).await;
     let start = Instant::now();
     let mut asking = tokio::task::JoinSet::new();
-    for incarnation in 1..=50 {
+    for process_id in 1..=50 {
         let url = learner.url.clone();
         asking.spawn(async move {
-            let hello = v1::Hello { incarnation, ..Puppet::hello() };
+            let hello = v1::Hello { process_id, ..Puppet::hello() };
             let mut puppet = Puppet::connect(&url, hello).await.unwrap();
             let answer = puppet.next().await;
             // Accepted actors stay until all have been answered.
@@ -102,7 +103,7 @@ async fn a_watcher_that_reads_nothing_loses_its_place_and_its_stream() {
     }
     assert!(messages < 16, "it was not sent everything: {messages} parts");
     // The one that listens was never disturbed.
-    learner.collector.event(RunEvent::Log("still here".into()));
+    learner.handle.observer().event(&RunEvent::Log("still here".into()));
     assert!(within(events.message()).await.unwrap().is_some());
     learner.stop().await;
 }
@@ -115,7 +116,7 @@ impl Worker for Flaky {
         &mut self,
         shard: &Shard,
         weights: &Weights,
-        _: &mut dyn magex_actor::goals::GoalSource,
+        _: &mut dyn magex_actor::goal_client::GoalSource,
     ) -> Result<ShardResult, WorkError> {
         let ShardResult::Train(mut trajectory) = result_of(&task(), shard, &weights.bytes) else { panic!("training") };
         if self.0.fetch_add(1, Ordering::SeqCst) % 10 == 9 {
@@ -145,7 +146,7 @@ async fn an_actor_whose_results_are_garbage_now_and_then_is_evicted_and_nothing_
         iteration += 1;
     }
     let error = bad.end().await.unwrap_err();
-    assert!(matches!(&error, ActorError::SentAway { reason, .. } if reason.contains("NaN is not finite")), "{error}");
+    assert!(matches!(&error, ActorError::Evicted { reason, .. } if reason.contains("NaN is not finite")), "{error}");
     assert_eq!(learner.ledger().rejected, 3);
     // Another actor does the rest.
     let good = Actor::start(&learner.url, "good", FakeWorker::default());
@@ -167,10 +168,10 @@ async fn an_evicted_process_is_not_accepted_again() {
         puppet.deliver(lease, &ShardResult::Train(bad)).await;
     }
     assert_eq!(puppet.next().await.unwrap_err().code(), Code::InvalidArgument);
-    let again = Puppet::connect(&learner.url, v1::Hello { incarnation: 9, ..Puppet::hello() }).await;
+    let again = Puppet::connect(&learner.url, v1::Hello { process_id: 9, ..Puppet::hello() }).await;
     let status = again.unwrap().next().await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition);
-    assert!(status.message().contains("start the actor anew"), "{status}");
+    assert!(status.message().contains("restart it"), "{status}");
     let _another = Puppet::ready(&learner.url, 10, 1).await;
     learner.stop().await;
 }

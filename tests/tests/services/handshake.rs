@@ -47,7 +47,7 @@ async fn manners_are_required() {
 async fn a_full_learner_says_so_and_when_to_try_again() {
     let learner = Learner::start_with(LearnerOptions { max_actors: 1, ..LearnerOptions::default() }).await;
     let _first = Puppet::ready(&learner.url, 1, 0).await;
-    let hello = v1::Hello { incarnation: 2, ..Puppet::hello() };
+    let hello = v1::Hello { process_id: 2, ..Puppet::hello() };
     let status = Puppet::connect(&learner.url, hello).await.unwrap().next().await.unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
     assert!(status.get_details_retry_info().is_some());

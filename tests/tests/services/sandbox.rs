@@ -1,7 +1,7 @@
 //! A learner, a commander and actors in this process, and an actor that a test plays itself.
 
 use bytes::Bytes;
-use magex_actor::goals::{GoalRequest, GoalSource};
+use magex_actor::goal_client::{GoalRequest, GoalSource};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
 use magex_commander::scheduler::{
@@ -322,8 +322,8 @@ impl Puppet {
     }
 
     /// Connects, is welcomed, and asks for work.
-    pub(crate) async fn ready(url: &str, incarnation: u64, credit: u32) -> Self {
-        let mut puppet = Self::connect(url, v1::Hello { incarnation, ..Self::hello() }).await.unwrap();
+    pub(crate) async fn ready(url: &str, process_id: u64, credit: u32) -> Self {
+        let mut puppet = Self::connect(url, v1::Hello { process_id, ..Self::hello() }).await.unwrap();
         assert!(matches!(puppet.next().await, Ok(Response::Welcome(_))));
         puppet.send(Request::Ready(v1::Ready { credit })).await;
         puppet

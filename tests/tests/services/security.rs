@@ -182,7 +182,7 @@ async fn an_actor_that_the_commander_does_not_let_in_ends_and_its_shard_is_done_
     };
     for (client, words) in [(Settings::default(), "authorization"), (bearing("fleet"), "role client")] {
         let error = asking(client).end().await.unwrap_err().to_string();
-        assert!(error.contains("does not let this actor in") && error.contains(words), "{error}");
+        assert!(error.contains("rejected this actor's credentials") && error.contains(words), "{error}");
     }
     // More often than a shard may fail for good.
     for _ in 0..4 {

@@ -6,7 +6,7 @@ use magex_core::ids::{RunId, Shard};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::collector::Collector as _;
-use magex_learner::serve::validate::{Limits, admit};
+use magex_learner::serve::validate::{Limits, validate};
 use magex_proto::convert::encode_result;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
@@ -50,7 +50,7 @@ async fn trajectories_of_several_megabytes() {
     let encoding = start.elapsed();
     let bytes = encoded.len();
     let start = Instant::now();
-    admit(&Limits::for_task(&task, 32), &run, encoded).unwrap();
+    validate(&Limits::for_task(&task, 32), &run, encoded).unwrap();
     println!(
         "encoding {:.2} ms, admitting {:.2} ms",
         encoding.as_secs_f64() * 1e3,

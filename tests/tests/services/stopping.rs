@@ -1,11 +1,13 @@
-//! Stopping: within the budget, with peers that do not let go, and with every peer notified.
+//! Shutdown: within its budget, whatever clients do, and with a notice to every client.
 
 use crate::sandbox::*;
-use magex_core::ids::Iteration;
+use magex_core::ids::{Iteration, RunId};
 use magex_learner::collector::Collector as _;
+use magex_learner::report::observer::{RunObserver as _, RunStart};
 use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
 use magex_proto::v1;
 use magex_proto::v1::watch_run_response::Event;
+use std::path::Path;
 use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 
@@ -44,7 +46,7 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
         reward: None,
         metrics_json: "{\"x\":1}".into(),
     };
-    learner.collector.event(RunEvent::Iteration(report));
+    learner.handle.observer().event(&RunEvent::Iteration(report));
     let status = learner.handle.status();
     assert_eq!((status.iteration, status.joint_env_steps, status.success), (1, 12, Some(0.5)));
     assert!(!status.metrics_json.is_empty());
@@ -52,7 +54,7 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     let mut events = client.watch_run(v1::WatchRunRequest {}).await.unwrap().into_inner();
     let first = within(events.message()).await.unwrap().unwrap();
     assert!(matches!(first.event, Some(Event::Iteration(event)) if event.metrics_json == "{\"x\":1}"));
-    learner.collector.event(RunEvent::Finished { summary_json: "{}".into() });
+    learner.handle.observer().event(&RunEvent::Finished { summary_json: "{}".into() });
     assert_eq!(learner.handle.status().state(), v1::RunState::Finished);
     learner.shutdown.cancel();
     assert!(matches!(within(events.message()).await.unwrap().unwrap().event, Some(Event::Finished(_))));
@@ -86,8 +88,8 @@ async fn a_drain_lets_the_iteration_finish() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_drain_without_an_actor_to_finish_the_iteration_ends_it() {
-    // First without an actor; then with one that leaves before the iteration is done.
+async fn a_drain_without_actors_ends_the_iteration() {
+    // No actor is connected, or the only one leaves before the iteration is done.
     for leaves in [false, true] {
         let mut learner = Learner::start().await;
         learner.collector.publish(&weights(0)).unwrap();
@@ -95,7 +97,7 @@ async fn a_drain_without_an_actor_to_finish_the_iteration_ends_it() {
         let puppet = if leaves { Some(Puppet::ready(&learner.url, 1, 1).await) } else { None };
         let mut client = learner_client(&learner.url).await;
         client.drain(v1::DrainRequest { reason: "new kernel".into() }).await.unwrap();
-        within(learner.handle.told()).await;
+        within(learner.handle.stop_signal()).await;
         let leaving = tokio::spawn(async move {
             tokio::time::sleep(Duration::from_millis(50)).await;
             drop(puppet);
@@ -108,8 +110,8 @@ async fn a_drain_without_an_actor_to_finish_the_iteration_ends_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_resumed_run_says_at_once_how_it_stood() {
-    let mut learner = Learner::start().await;
+async fn a_resumed_run_reports_its_last_iteration_at_once() {
+    let learner = Learner::start().await;
     let before = IterationReport {
         iteration: Iteration(7),
         joint_env_steps: 70,
@@ -117,7 +119,8 @@ async fn a_resumed_run_says_at_once_how_it_stood() {
         reward: Some(-1.0),
         metrics_json: "{}".into(),
     };
-    learner.collector.resumed(&before);
+    let (run_id, folder) = (RunId("run".into()), Path::new("nowhere"));
+    learner.handle.observer().begin(RunStart { run_id: &run_id, folder, before: Some(&before) });
     let status = learner.handle.status();
     assert_eq!((status.iteration, status.joint_env_steps, status.success), (7, 70, Some(0.5)));
     assert_eq!((status.reward, status.metrics_json.as_str()), (Some(-1.0), "{}"));

@@ -4,7 +4,7 @@ use crate::artifacts::{write_curve, write_recorded_replay};
 use crate::cli::Global;
 use crate::failure::{coded, usage};
 use crate::folder;
-use crate::local::LocalCollector;
+use crate::local::{EventChannel, LocalCollector};
 use crate::output::{Output, note, program, seconds, thousands};
 use crate::progress::Progress;
 use crate::settings::{self, Overrides};
@@ -15,7 +15,7 @@ use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_learner::page::{LivePage, RunInfo};
 use magex_learner::report::metrics_file::Summary;
-use magex_learner::trainer::{Outcome, TrainError, Trainer};
+use magex_learner::trainer::{TrainError, TrainOutcome, Trainer};
 use magex_runtime::{backoff, exit, http, server, shutdown};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -210,14 +210,15 @@ fn in_process(job: &Job, progress: &mut Progress) -> anyhow::Result<End> {
     let (shown, serving) = page.unzip();
     let watched = shown.clone();
     let (events, received) = mpsc::channel();
-    let mut collector = LocalCollector::new(&job.config, job.threads, events, stop);
+    let mut collector = LocalCollector::new(&job.config, job.threads, stop);
     let outcome = std::thread::scope(|scope| {
         let training = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20).spawn_scoped(
             scope,
             move || {
                 let mut trainer = trainer(job)?;
+                trainer.observe(EventChannel(events));
                 if let Some(page) = shown {
-                    trainer.show(page);
+                    trainer.observe(page);
                 }
                 trainer.run(&mut collector)
             },
@@ -234,15 +235,15 @@ fn in_process(job: &Job, progress: &mut Progress) -> anyhow::Result<End> {
         let _ = runtime.block_on(serving);
     }
     match outcome? {
-        Outcome::Finished(_) => Ok(End::Finished),
-        Outcome::Stopped(_) => Ok(End::Stopped),
+        TrainOutcome::Finished(_) => Ok(End::Finished),
+        TrainOutcome::Stopped(_) => Ok(End::Stopped),
     }
 }
 
 /// A new trainer, or one that continues; says what was wrong with newer checkpoints.
 pub(crate) fn trainer(job: &Job) -> Result<Trainer, TrainError> {
     if !job.resume {
-        let run_id = RunId(format!("{:016x}", backoff::incarnation()));
+        let run_id = RunId(format!("{:016x}", backoff::random_id()));
         return Trainer::create(&job.config, run_id, &job.folder, job.threads);
     }
     let (trainer, skipped) = Trainer::resume(&job.config, &job.folder, job.threads)?;

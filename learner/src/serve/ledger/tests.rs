@@ -85,9 +85,9 @@ fn a_result_of_another_shard_than_the_leased_one_is_rejected_and_redone() {
 }
 
 /// One attempt that fails for good, by an actor whose process has the number of its session.
-fn fail(ledger: &mut Ledger, session: u64, actor: &str, present: &[u64]) {
+fn fail(ledger: &mut Ledger, session: u64, actor: &str, connected: &[u64]) {
     let lease = ledger.lease(SessionId(session)).unwrap();
-    let failure = Failure { actor, process: session, reason: "no such task", present };
+    let failure = ShardFailure { actor, process: session, reason: "no such task", connected };
     assert!(ledger.fail(SessionId(session), lease.id, &failure));
 }
 
@@ -117,7 +117,7 @@ fn a_shard_is_given_up_that_three_different_actors_cannot_do() {
 }
 
 #[test]
-fn an_actor_that_is_started_anew_is_no_other_actor() {
+fn a_restarted_actor_is_the_same_actor() {
     let mut ledger = opened(1);
     for process in 1..=2 * u64::from(MAX_FAILURES) {
         fail(&mut ledger, process, "broken", &[process, 100]);
@@ -149,7 +149,7 @@ fn a_failure_of_a_lease_that_is_held_no_more_says_nothing() {
     let mut ledger = opened(1);
     let lease = ledger.lease(A).unwrap();
     ledger.drop_actor(A);
-    let failure = Failure { actor: "a", process: 1, reason: "x", present: &[1] };
+    let failure = ShardFailure { actor: "a", process: 1, reason: "x", connected: &[1] };
     for _ in 0..MAX_FAILURES {
         assert!(!ledger.fail(A, lease.id, &failure));
     }
@@ -213,7 +213,7 @@ proptest! {
                     if retryable {
                         ledger.give_back(SessionId(actor), lease.id);
                     } else {
-                        let failure = Failure { actor: "x", process: actor, reason: "x", present: &[0, 1, 2] };
+                        let failure = ShardFailure { actor: "x", process: actor, reason: "x", connected: &[0, 1, 2] };
                         ledger.fail(SessionId(actor), lease.id, &failure);
                     }
                 },

@@ -160,15 +160,15 @@ pub(super) async fn press(
 }
 
 /// One actor, until it is cancelled.
-async fn send(url: String, incarnation: u64, results: Arc<Vec<Bytes>>, accepted: Arc<AtomicU64>) -> anyhow::Result<()> {
+async fn send(url: String, process_id: u64, results: Arc<Vec<Bytes>>, accepted: Arc<AtomicU64>) -> anyhow::Result<()> {
     let channel = client::endpoint(&url)?.connect().await?;
     let mut client = LearnerServiceClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let (say, requests) = mpsc::channel(4);
     let message = |message| v1::RolloutRequest { message: Some(message) };
     let hello = v1::Hello {
         protocol_version: PROTOCOL_VERSION,
-        actor_id: format!("simulated-{incarnation}"),
-        incarnation,
+        actor_id: format!("simulated-{process_id}"),
+        process_id,
         threads: 1,
         ..Default::default()
     };

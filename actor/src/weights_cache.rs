@@ -1,34 +1,35 @@
-//! The weights that an actor holds: the latest that arrived and the one before, verified.
+//! The weights that an actor holds: the two latest arrivals, verified.
 
 use magex_proto::goals::WeightsKey;
 use magex_proto::weights::Weights;
+use magex_runtime::sync::lock;
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 
-/// Versions that are held.
+/// Number of versions held.
 const KEPT: usize = 2;
 
-/// Weights that did not come.
+/// Why the weights are not available.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CacheError {
-    /// They did not come in time.
+    /// They did not arrive in time.
     #[error("weights version {wanted} did not arrive within {waited:?}; here are versions {held:?}")]
     TimedOut {
-        /// Version that was waited for.
+        /// The version waited for.
         wanted: u32,
-        /// How long.
+        /// Time waited.
         waited: Duration,
         /// Versions that are held.
         held: Vec<u32>,
     },
-    /// Nobody wants the result any more.
-    #[error("no longer wanted")]
+    /// The pool shuts down; the result is no longer needed.
+    #[error("cancelled: the result is no longer needed")]
     Cancelled,
 }
 
-/// Filled by the weights stream, read by rollout threads, which wait for the version that their shard names.
+/// Filled by the weights stream; rollout threads wait here for the version that their shard names.
 #[derive(Debug, Default)]
 pub struct WeightsCache {
     held: Mutex<VecDeque<Arc<Weights>>>,
@@ -36,9 +37,9 @@ pub struct WeightsCache {
 }
 
 impl WeightsCache {
-    /// Holds weights that arrived, in place of what had the same name, and forgets the oldest arrival.
+    /// Inserts weights, replaces those of the same run and version, and drops the oldest arrival.
     pub fn insert(&self, weights: Weights) {
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut held = lock(&self.held);
         held.retain(|old| (&old.run_id, old.version) != (&weights.run_id, weights.version));
         held.push_back(Arc::new(weights));
         while held.len() > KEPT {
@@ -48,7 +49,7 @@ impl WeightsCache {
         self.changed.notify_all();
     }
 
-    /// The weights of this name, as soon as they are here. Blocks for at most `patience`, or until `cancelled` followed by
+    /// Returns these weights as soon as they have arrived. Blocks for at most `patience`, or until `cancelled` followed by
     /// [`WeightsCache::wake`].
     pub fn wait(
         &self,
@@ -57,7 +58,7 @@ impl WeightsCache {
         cancelled: &CancellationToken,
     ) -> Result<Arc<Weights>, CacheError> {
         let deadline = Instant::now() + patience;
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut held = lock(&self.held);
         loop {
             let is_wanted = |weights: &&Arc<Weights>| {
                 (&weights.run_id, weights.version, &weights.sha256) == (&wanted.run_id, wanted.version, &wanted.sha256)
@@ -77,10 +78,10 @@ impl WeightsCache {
         }
     }
 
-    /// Lets everybody who waits look again.
+    /// Wakes all waiting threads, so that they check for cancellation.
     pub fn wake(&self) {
-        // With the lock, so that nobody is between looking and waiting.
-        drop(self.held.lock().unwrap_or_else(PoisonError::into_inner));
+        // Taking the lock ensures that no thread is between its check and its wait.
+        drop(lock(&self.held));
         self.changed.notify_all();
     }
 }
@@ -104,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn the_latest_two_are_held() {
+    fn the_two_latest_are_held() {
         let (cache, token) = (WeightsCache::default(), CancellationToken::new());
         (1..=3).for_each(|version| cache.insert(weights(version)));
         for version in [2, 3] {

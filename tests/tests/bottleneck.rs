@@ -1,8 +1,8 @@
-//! Each part of the cluster is made slow in turn, and the iterations' verdict follows.
+//! Each part of the cluster is slowed down in turn, and the reported bottleneck follows.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_actor::goals::GoalSource;
-use magex_actor::policy::PolicyWorker;
+use magex_actor::goal_client::GoalSource;
+use magex_actor::policy_worker::PolicyWorker;
 use magex_actor::run::ActorConfig;
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
 use magex_commander::service::CommanderConfig;
@@ -68,9 +68,9 @@ fn late(delay: Duration) -> MakeWorker {
     Arc::new(move |welcome| Ok(Box::new(Late { worker: Box::new(PolicyWorker::new(welcome)?), delay })))
 }
 
-/// Trains with one actor on one thread; what each iteration but the first, which waits for the actor, was bound by, and
-/// the hash of what was learned.
-fn verdicts(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64>) -> (Vec<String>, String) {
+/// Trains with one actor on one thread; the bottleneck of each iteration but the first, which waits for the actor, and the
+/// hash of the weights.
+fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64>) -> (Vec<String>, String) {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let mut trainer = Trainer::create(config, RunId("test".into()), folder.path(), 1).unwrap();
@@ -112,27 +112,27 @@ fn verdicts(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64>) 
     let lines = std::fs::read_to_string(folder.path().join("metrics.jsonl")).unwrap();
     let lines: Vec<serde_json::Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     for line in &lines {
-        let seconds = |name: &str| line["timing"]["bound"][name].as_f64().unwrap();
+        let seconds = |name: &str| line["timing"]["bottleneck"][name].as_f64().unwrap();
         let collect = line["timing"]["collect_s"].as_f64().unwrap();
         assert!((seconds("actor_s") + seconds("network_s") - collect).abs() < 1e-6, "{line}");
     }
     let trained = lines.iter().skip(1).filter(|line| !line["executor"].is_null());
-    let by = trained.map(|line| line["timing"]["bound"]["by"].as_str().unwrap().to_owned()).collect();
+    let stages = trained.map(|line| line["timing"]["bottleneck"]["stage"].as_str().unwrap().to_owned()).collect();
     let weights = trainer.learned().weights().unwrap();
     runtime.shutdown_background();
-    (by, magex_learner::checkpoint::sha256_hex(&weights))
+    (stages, magex_learner::checkpoint::sha256_hex(&weights))
 }
 
 /// Most of the iterations say so: what else runs on the machine may blur one.
 fn check(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64>, expected: &str) -> String {
-    let (by, sha256) = verdicts(config, delay, bytes_per_second);
+    let (by, sha256) = bottlenecks(config, delay, bytes_per_second);
     let said = by.iter().filter(|by| *by == expected).count();
     assert!(2 * said > by.len(), "{expected} was expected: {by:?}");
     sha256
 }
 
 #[test]
-fn the_verdict_follows_what_is_slow_and_changes_no_number() {
+fn the_bottleneck_is_the_slow_stage_and_changes_no_number() {
     let quick = small(ExecutorKind::Local, 5, 4);
     let mut thorough = quick.clone();
     thorough.mappo.epochs = 150;

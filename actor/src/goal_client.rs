@@ -1,4 +1,4 @@
-//! Where a worker gets its goals from.
+//! The client of the commander service: the goals of a shard's episodes.
 
 use magex_proto::MAX_BATCH_BYTES;
 pub use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind, WeightsKey};
@@ -13,37 +13,37 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Status};
 use tracing::Span;
 
-/// A call that takes longer is made again. The commander itself waits up to 5 s for weights.
+/// Deadline of one call; a call that exceeds it is retried. The commander itself waits up to 5 s for weights.
 const CALL_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Why there are no goals.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum GoalError {
-    /// Nobody wants the result any more.
-    #[error("no longer wanted")]
+    /// The pool shuts down; the result is no longer needed.
+    #[error("cancelled: the result is no longer needed")]
     Cancelled,
-    /// The commander did not answer for so long; another attempt may fare better.
+    /// The commander did not answer within this time; another attempt may succeed.
     #[error("the commander did not answer within {} s", .0.as_secs_f64())]
     Late(Duration),
-    /// The commander does not know this actor, or does not answer one of its role: no shard can be done here.
-    #[error("the commander does not let this actor in: {0}; give it a token or a certificate of an actor")]
-    NotLetIn(String),
-    /// The commander refused, and would refuse again.
-    #[error("the commander refused: {0}")]
+    /// The commander rejected the actor's credentials or role, so every shard would fail here.
+    #[error("the commander rejected this actor's credentials: {0}; give it an actor's token or certificate")]
+    Unauthorized(String),
+    /// The commander rejected the request; a retry would fail too.
+    #[error("the commander rejected the request: {0}")]
     Refused(String),
-    /// The answer makes no sense.
-    #[error("the commander's answer makes no sense: {0}")]
+    /// The answer does not match the request.
+    #[error("the commander's answer is invalid: {0}")]
     Answer(String),
 }
 
-/// Hands out the goals of a shard's episodes with the weights that the shard names. Blocks.
+/// Assigns the goals of a shard's episodes with the weights that the shard names. Blocks.
 pub trait GoalSource {
     /// One goal per agent of every episode.
     fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError>;
 }
 
-/// Asks the commander service, again and again while it is late or away, for as long as its patience lasts: a commander that
-/// never gets the version (the learner went back to an older one) must not keep a rollout thread for ever.
+/// Calls the commander service and retries while it is slow or unavailable, up to `patience`. The limit keeps a rollout thread
+/// from waiting forever for a version that the commander never gets (the learner went back to an older one).
 #[derive(Debug)]
 pub struct GrpcGoals {
     runtime: Handle,
@@ -56,7 +56,7 @@ pub struct GrpcGoals {
 }
 
 impl GrpcGoals {
-    /// Asks these weights over this channel, until cancelled or out of patience.
+    /// A client that names these weights in every request. Calls end when cancelled or after `patience`.
     pub fn new(
         runtime: Handle,
         channel: Channel,
@@ -70,12 +70,12 @@ impl GrpcGoals {
         Self { runtime, client, weights, patience, cancelled, waited: Duration::ZERO, parent: Span::none() }
     }
 
-    /// Makes the waits part of a trace.
+    /// Makes the calls part of a trace.
     pub(crate) fn trace(&mut self, parent: &Span) {
         self.parent = parent.clone();
     }
 
-    /// How long its caller has waited for goals in all.
+    /// Total time that callers have waited for goals.
     pub(crate) fn waited(&self) -> Duration {
         self.waited
     }
@@ -119,7 +119,7 @@ async fn ask(
                 if !is_transient(&status)
                     && matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied) =>
             {
-                return Err(GoalError::NotLetIn(status.message().to_owned()));
+                return Err(GoalError::Unauthorized(status.message().to_owned()));
             }
             Ok(Err(status)) if !is_transient(&status) => {
                 return Err(GoalError::Refused(format!("{}: {}", status.code(), status.message())));
@@ -129,13 +129,13 @@ async fn ask(
         };
         failures += 1;
         if failures == 1 {
-            tracing::warn!(reason = problem, "the commander does not answer; trying again for as long as it takes");
+            tracing::warn!(reason = problem, "the commander does not answer; retrying");
         }
         tokio::time::sleep(backoff.next_wait()).await;
     }
 }
 
-/// A commander that is being started may not know its own service yet; one of another size may answer the next call.
+/// UNIMPLEMENTED is transient too: a commander that is starting may not have registered its service yet.
 fn is_transient(status: &Status) -> bool {
     status::is_transient(status) || status.code() == Code::Unimplemented
 }

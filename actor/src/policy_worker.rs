@@ -1,6 +1,6 @@
-//! The worker of production: rolls out shards with the executor that their weights contain.
+//! The worker of production: it rolls out shards with the executor that their weights contain.
 
-use crate::goals::GoalSource;
+use crate::goal_client::GoalSource;
 use crate::rollout::{Roller, RolloutError};
 use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
 use magex_core::config::RunConfig;
@@ -9,7 +9,7 @@ use magex_core::trajectory::ShardResult;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
 
-/// Rolls out shards. Keeps the executor of the latest weights, so that a version is loaded once.
+/// Rolls out shards. Keeps the executor of the latest weights, so that each version is loaded once.
 #[derive(Debug)]
 pub struct PolicyWorker {
     config: RunConfig,
@@ -20,7 +20,7 @@ impl PolicyWorker {
     /// A worker for the run that the learner described.
     ///
     /// # Errors
-    /// When the configuration cannot be read, or means another task to this build than to the learner's.
+    /// The configuration cannot be parsed, or this build gives its task another fingerprint than the learner does.
     pub fn new(welcome: &Welcome) -> Result<Self, WorkError> {
         let config =
             RunConfig::from_toml(&welcome.run_config_toml).map_err(|error| WorkError::fatal(error.to_string()))?;
@@ -35,7 +35,7 @@ impl PolicyWorker {
         Ok(Self { config, roller: None })
     }
 
-    /// Makes such workers.
+    /// A factory of such workers.
     pub fn maker() -> MakeWorker {
         Arc::new(|welcome| Ok(Box::new(Self::new(welcome)?)))
     }

@@ -1,4 +1,4 @@
-//! The actor's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
+//! The actor's Prometheus metrics, each declared once; docs/metrics.md describes them.
 
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::task::TaskConfig;
@@ -6,9 +6,9 @@ use magex_proto::v1::ShardTiming;
 use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Metrics, Seconds};
 use std::time::Duration;
 
-/// Everything that an actor counts.
+/// The metrics of an actor.
 #[derive(Debug)]
-pub(crate) struct ActorGauges {
+pub(crate) struct ActorMetrics {
     shards: Counters,
     joint_steps: Counters,
     agent_steps: Counters,
@@ -26,51 +26,45 @@ pub(crate) struct ActorGauges {
     queue: Gauges,
 }
 
-/// What became of shards; the label of a metric.
+/// Outcomes of shards; the label of a metric.
 const OUTCOMES: [&str; 5] = ["done", "failed", "accepted", "duplicate", "rejected"];
 /// Queues of an actor; the label of a metric.
-const QUEUES: [&str; 3] = ["jobs", "unsettled", "outbound"];
+const QUEUES: [&str; 3] = ["shards", "unacknowledged", "outbound"];
 
-impl ActorGauges {
-    /// Declares them.
+impl ActorMetrics {
+    /// Declares all of them.
     pub(crate) fn new(m: &Metrics) -> Self {
-        let gauges = Self {
-            shards: m.counters("magex_actor_shards_total", "Shards by what became of them.", &["outcome"]),
+        let metrics = Self {
+            shards: m.counters("magex_actor_shards_total", "Shards by outcome.", &["outcome"]),
             joint_steps: m.counters("magex_actor_joint_steps_total", "Joint steps rolled out.", &["kind"]),
             agent_steps: m.counters("magex_actor_agent_steps_total", "Agent steps rolled out.", &["kind"]),
             rollout: m.seconds("magex_actor_rollout_seconds", "Rolling out a shard, waits excluded."),
             goals_wait: m.seconds("magex_actor_goals_wait_seconds", "Waiting for the goals of a shard."),
             weights_wait: m.seconds("magex_actor_weights_wait_seconds", "Waiting for the weights of a shard."),
-            upload: m.seconds(
-                "magex_actor_upload_seconds",
-                "From a result's being ready to the learner's having settled it.",
-            ),
+            upload: m
+                .seconds("magex_actor_upload_seconds", "From the result's encoding to the learner's acknowledgement."),
             upload_bytes: m.counter("magex_actor_upload_bytes_total", "Bytes of results handed to the connection."),
             weights_bytes: m.counter("magex_actor_weights_bytes_total", "Bytes of weights that arrived."),
             weights_version: m.gauge("magex_actor_weights_version", "Newest version of the weights that arrived."),
             connected: m.gauge("magex_actor_connected_state", "1 while a learner has accepted this actor, else 0."),
             reconnects: m.counter("magex_actor_reconnects_total", "Connections to a learner after the first."),
             threads: m.gauge("magex_actor_rollout_threads", "Rollout threads."),
-            busy: m.gauge("magex_actor_busy_threads", "Rollout threads that have a shard."),
-            queue: m.gauges("magex_actor_queue_messages", "What waits in the actor's queues.", &["queue"]),
+            busy: m.gauge("magex_actor_busy_threads", "Rollout threads with a shard."),
+            queue: m.gauges("magex_actor_queue_messages", "Messages that wait in the actor's queues.", &["queue"]),
         };
         // A scrape shows all of them from the start.
-        OUTCOMES.iter().for_each(|outcome| gauges.shards(outcome));
-        QUEUES.iter().for_each(|queue| gauges.queue(queue, 0));
+        OUTCOMES.iter().for_each(|outcome| metrics.shards.with(&[outcome]).add(0));
+        QUEUES.iter().for_each(|queue| metrics.queue(queue, 0));
         for kind in ["train", "eval"] {
-            gauges.joint_steps.with(&[kind]).add(0);
-            gauges.agent_steps.with(&[kind]).add(0);
+            metrics.joint_steps.with(&[kind]).add(0);
+            metrics.agent_steps.with(&[kind]).add(0);
         }
-        gauges
+        metrics
     }
 
-    /// Another shard came to this.
+    /// Counts a shard with this outcome.
     pub(crate) fn outcome(&self, outcome: &str) {
         self.shards.with(&[outcome]).add(1);
-    }
-
-    fn shards(&self, outcome: &str) {
-        self.shards.with(&[outcome]).add(0);
     }
 
     pub(crate) fn queue(&self, name: &str, messages: usize) {

@@ -1,0 +1,66 @@
+//! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
+
+use crate::page::{Phase, RunEnd};
+use crate::report::metrics_file::{FileError, IterationMetrics};
+use crate::run_events::{IterationReport, RunEvent};
+use magex_core::ids::RunId;
+use magex_core::trajectory::EvalOutcome;
+use magex_proto::weights::Weights;
+use std::fmt::Debug;
+use std::path::Path;
+use std::time::Duration;
+
+/// The run as an observer finds it.
+#[derive(Debug, Clone, Copy)]
+pub struct RunStart<'a> {
+    /// Identity of the run.
+    pub run_id: &'a RunId,
+    /// Folder of the run.
+    pub folder: &'a Path,
+    /// The last iteration of an earlier process, if the run is resumed.
+    pub before: Option<&'a IterationReport>,
+}
+
+/// Follows a run. The training thread calls every observer of the trainer's list, in the order of the list, and waits: an
+/// observer must not block on a network or a reader. Nothing that an observer does changes a number of the run.
+pub trait RunObserver: Debug + Send {
+    /// Called once, before any other method.
+    fn begin(&mut self, _start: RunStart<'_>) {}
+
+    /// Whether an episode of every evaluation should be recorded for this observer.
+    fn wants_recording(&self) -> bool {
+        false
+    }
+
+    /// The training thread enters another phase of the iteration.
+    fn phase(&mut self, _phase: Phase) {}
+
+    /// A version of the weights was published.
+    fn published(&mut self, _weights: &Weights) {}
+
+    /// An evaluation was collected.
+    fn evaluated(&mut self, _outcomes: &[EvalOutcome]) {}
+
+    /// An iteration is complete. `report` has its line of metrics.jsonl.
+    fn iteration(&mut self, _metrics: &IterationMetrics, _report: &IterationReport) {}
+
+    /// An attempt to write a checkpoint ended. `written` is its folder; `None` if it could not be written.
+    fn checkpoint(&mut self, _took: Duration, _written: Option<&Path>) {}
+
+    /// Something else happened: a message, a checkpoint, or the end of the run.
+    fn event(&mut self, _event: &RunEvent) {}
+
+    /// Makes what was written so far durable, before a checkpoint that contains it. Errors show again in [`Self::flush`].
+    fn sync(&mut self) {}
+
+    /// Writes what an earlier error left unwritten, before the summary.
+    ///
+    /// # Errors
+    /// A file still cannot be written.
+    fn flush(&mut self) -> Result<(), FileError> {
+        Ok(())
+    }
+
+    /// Training ends in this process.
+    fn end(&mut self, _end: &RunEnd) {}
+}

@@ -1,0 +1,70 @@
+//! The service as an observer of the run: Prometheus, the status, the event streams and the log.
+
+use crate::report::metrics_file::IterationMetrics;
+use crate::report::observer::{RunObserver, RunStart};
+use crate::run_events::{IterationReport, RunEvent};
+use crate::serve::shared::Shared;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Made by [`crate::serve::service::LearnerHandle::observer`].
+#[derive(Debug)]
+pub struct ServiceObserver {
+    shared: Arc<Shared>,
+}
+
+impl ServiceObserver {
+    pub(crate) fn new(shared: Arc<Shared>) -> Self {
+        Self { shared }
+    }
+}
+
+impl RunObserver for ServiceObserver {
+    /// The status shows the last iteration of an earlier process; watchers receive only new events.
+    fn begin(&mut self, start: RunStart<'_>) {
+        if let Some(before) = start.before {
+            self.shared.status.iteration(before);
+        }
+    }
+
+    fn iteration(&mut self, metrics: &IterationMetrics, report: &IterationReport) {
+        self.shared.metrics.iteration(metrics);
+        let (bottleneck, timing) = (&metrics.timing.bottleneck, &metrics.timing);
+        tracing::info!(
+            iteration = metrics.iteration,
+            joint_env_steps = metrics.joint_env_steps,
+            success_rate = metrics.episodes.get(SUCCESS_RATE),
+            reward = metrics.episodes.get(REWARD),
+            bottleneck = bottleneck.stage.name(),
+            actor_s = bottleneck.actor_s,
+            learner_s = bottleneck.learner_s,
+            network_s = bottleneck.network_s,
+            collect_s = timing.collect_s,
+            "iteration"
+        );
+        self.event(&RunEvent::Iteration(report.clone()));
+    }
+
+    fn checkpoint(&mut self, took: Duration, written: Option<&Path>) {
+        self.shared.metrics.checkpoint(took, written.map(size_of));
+    }
+
+    fn event(&mut self, event: &RunEvent) {
+        match event {
+            RunEvent::Iteration(report) => self.shared.status.iteration(report),
+            RunEvent::Finished { .. } => self.shared.status.finish(),
+            RunEvent::Log(_) | RunEvent::Checkpoint { .. } => {}
+        }
+        self.shared.events.push(event.clone());
+        if matches!(event, RunEvent::Finished { .. }) {
+            self.shared.control.complete.cancel();
+        }
+    }
+}
+
+/// Bytes of the files in a folder.
+fn size_of(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+    entries.filter_map(|entry| entry.metadata().ok()).map(|meta| meta.len()).sum()
+}
