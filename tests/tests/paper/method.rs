@@ -257,3 +257,27 @@ fn section_4_3_the_likelihoods_of_acting_are_those_of_the_update() {
         assert_eq!(line["executor"]["first_ratio_error"], 0.0);
     }
 }
+
+#[test]
+fn section_4_3_the_surrogate_is_clipped_and_the_first_step_is_not() {
+    let learned = |epochs: u32, clip: f32| {
+        let mut config = small(ExecutorKind::Local, 5, 1);
+        (config.mappo.epochs, config.mappo.minibatch_size, config.mappo.clip_epsilon) = (epochs, 100_000, clip);
+        run(&config).2.executor
+    };
+    // One step: every ratio is 1 and every value the old one, so the limits cannot matter. From the second step on they do.
+    assert_eq!(learned(1, 0.001), learned(1, 0.2));
+    assert_ne!(learned(3, 0.001), learned(3, 0.2));
+}
+
+#[test]
+fn section_4_3_the_value_loss_is_linear_beyond_delta() {
+    let critic = |delta: f32| {
+        let mut config = small(ExecutorKind::Local, 5, 1);
+        config.mappo.huber_delta = delta;
+        run(&config).2.executor.critic
+    };
+    // Targets are normalised: no error of this run is as large as 10, many are larger than 0.01.
+    assert_eq!(critic(10.0), critic(1e6));
+    assert_ne!(critic(10.0), critic(0.01));
+}
