@@ -13,7 +13,7 @@ fn undisturbed(config: &RunConfig) -> String {
 }
 
 /// Enough that a fast machine is not at the end of the run before [`LEAST_ROUNDS`].
-const ITERATIONS: u64 = 1500;
+const ITERATIONS: u64 = 1000;
 /// Rounds of events that a run must have seen.
 const LEAST_ROUNDS: usize = 8;
 

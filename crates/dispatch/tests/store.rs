@@ -254,7 +254,10 @@ fn a_real_disk_that_was_full_is_used_again() {
     let folder = tempfile::tempdir().unwrap();
     let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=4m", "magex-test"]).arg(folder.path()).status();
     if !mount.is_ok_and(|status| status.success()) {
-        assert!(std::env::var_os("MAGEX_CI_MOUNT").is_none(), "a small file system cannot be mounted, and must be here");
+        assert!(
+            std::env::var_os("MAGEX_CI_MOUNT").is_none(),
+            "a small file system cannot be mounted, and must be here"
+        );
         eprintln!("NOT CHECKED: a full disk below the missions; this user cannot mount a small file system");
         return;
     }

@@ -10,7 +10,7 @@ type Path = Vec<String>;
 /// A module is a file. An edge is a path that begins with `crate::`, `super::` or `self::`, in a `use` or anywhere else,
 /// and leads to an item of another module, through re-exports to where the item is defined. Between a module and those
 /// above or below it there is no edge: `mod` and `pub use` are what a folder is made of.
-pub fn cycles(modules: &Modules) -> Vec<BTreeSet<String>> {
+pub(crate) fn cycles(modules: &Modules) -> Vec<BTreeSet<String>> {
     let sources: BTreeMap<Path, String> = modules
         .product
         .iter()

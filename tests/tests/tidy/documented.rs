@@ -5,7 +5,7 @@ use magex_core::config::RunConfig;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 
 /// Every configuration key with its default, as TOML: the default run, and the sections of the other tasks.
-pub fn configuration() -> String {
+pub(crate) fn configuration() -> String {
     let mut config = RunConfig::default().to_toml().unwrap();
     for name in [TaskName::PushBall, TaskName::Drones] {
         let task = TaskConfig::of(name, 4, Spawn::Uniform);

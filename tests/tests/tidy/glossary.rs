@@ -39,9 +39,10 @@ fn glossary(text: &str) -> BTreeSet<String> {
     rows.filter_map(|row| row.split('|').nth(1)).flat_map(words).collect()
 }
 
-/// Whether a word or its singular is known.
+/// Whether a word is known, or the word that it is the plural of.
 fn knows(known: &BTreeSet<String>, word: &str) -> bool {
-    known.contains(word) || word.strip_suffix('s').is_some_and(|one| known.contains(one))
+    let singular = ["s", "es"].iter().any(|ending| word.strip_suffix(ending).is_some_and(|one| known.contains(one)));
+    known.contains(word) || singular
 }
 
 fn words(name: &str) -> Vec<String> {

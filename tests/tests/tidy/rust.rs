@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// `text` with comments and the contents of literals blanked out; every line keeps its number and its length in bytes.
-pub fn code_only(text: &str) -> String {
+pub(crate) fn code_only(text: &str) -> String {
     let bytes = text.as_bytes();
     let mut out = bytes.to_vec();
     let mut at = 0;
@@ -65,7 +65,7 @@ fn end_of_string(bytes: &[u8], mut at: usize) -> usize {
 }
 
 /// Byte ranges of the items behind `#[cfg(test)]`, wherever they stand. `code` comes from [`code_only`].
-pub fn test_items(code: &str) -> Vec<std::ops::Range<usize>> {
+pub(crate) fn test_items(code: &str) -> Vec<std::ops::Range<usize>> {
     const MARK: &str = "#[cfg(test)]";
     let mut found: Vec<std::ops::Range<usize>> = Vec::new();
     for (start, _) in code.match_indices(MARK) {
@@ -112,12 +112,12 @@ fn end_of_item(code: &str, mut at: usize) -> usize {
 }
 
 /// The identifiers and keywords of a text, in order.
-pub fn identifiers(code: &str) -> impl Iterator<Item = &str> {
+pub(crate) fn identifiers(code: &str) -> impl Iterator<Item = &str> {
     code.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|word| !word.is_empty())
 }
 
 /// The code of a file without what only tests see; lines keep their numbers.
-pub fn product_code(text: &str) -> String {
+pub(crate) fn product_code(text: &str) -> String {
     let code = code_only(text);
     let mut out = code.clone().into_bytes();
     for range in test_items(&code) {
@@ -127,7 +127,7 @@ pub fn product_code(text: &str) -> String {
 }
 
 /// How many lines of a file, comments and blank lines among them, are not behind `#[cfg(test)]`.
-pub fn product_lines(text: &str) -> usize {
+pub(crate) fn product_lines(text: &str) -> usize {
     let items = test_items(&code_only(text));
     let lines_of = |range: &std::ops::Range<usize>| text[range.clone()].matches('\n').count() + 1;
     text.lines().count() - items.iter().map(lines_of).sum::<usize>().min(text.lines().count())
@@ -135,15 +135,15 @@ pub fn product_lines(text: &str) -> usize {
 
 /// The modules of one library or binary that are files of their own: path in the crate (`[]` is the root) to file.
 #[derive(Debug, Default)]
-pub struct Modules {
+pub(crate) struct Modules {
     /// Part of the product.
-    pub product: BTreeMap<Vec<String>, PathBuf>,
+    pub(crate) product: BTreeMap<Vec<String>, PathBuf>,
     /// Behind `#[cfg(test)]`, and everything below such a module.
-    pub tests: BTreeSet<PathBuf>,
+    pub(crate) tests: BTreeSet<PathBuf>,
 }
 
 /// Follows the `mod name;` declarations from a crate's root file.
-pub fn modules(root_file: &Path) -> Modules {
+pub(crate) fn modules(root_file: &Path) -> Modules {
     let mut found = Modules::default();
     follow(root_file, &[], false, &mut found);
     found
