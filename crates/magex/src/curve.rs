@@ -116,7 +116,7 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
         header.draw_text(subtitle, &text(15).color(&SOFT), (24, 42)).map_err(drawing)?;
         for (index, (metric, scale, series)) in panels.iter().enumerate() {
             let (area, below) = rest.split_vertically(heights[index]);
-            let name = format!("{}, {}", metric.show.label, metric.unit);
+            let name = format!("{}, {}", metric.label, metric.unit);
             panel(&area, &name, *scale, series, last, index + 1 == panels.len())?;
             rest = below;
         }
@@ -127,7 +127,7 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
 
 /// The plot of a metric, if it has one and the run has the metric.
 fn panel_of<'a>(metric: &'a Metric, points: &[MetricsPoint]) -> Option<(&'a Metric, Scale, Vec<Series>)> {
-    let scale = metric.show.plot?;
+    let scale = metric.plot?;
     let sampled = metric.sampled.map(|column| line("sampled, training episodes", BLUE, points, column));
     let greedy = metric.greedy().then(|| line("greedy evaluation", GREEN, points, metric.name));
     let mut series: Vec<Series> = sampled.into_iter().chain(greedy).collect();

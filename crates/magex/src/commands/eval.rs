@@ -129,7 +129,7 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
     }
 
     let mut means = Map::new();
-    let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.show.label);
+    let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.label);
     let heading: Vec<&str> = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
