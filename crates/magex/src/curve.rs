@@ -277,6 +277,7 @@ fn drawing(error: impl std::fmt::Display) -> CurveError {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::json;
 
     const LINE: &str = r#"{"iteration":0,"joint_env_steps":1000,"success_rate":null,"reward":-1.5,"loss":3}"#;
 
@@ -312,13 +313,12 @@ mod tests {
         let svg = curve_svg("a <run> & more", "N = 5", &points).unwrap();
         assert!(svg.contains("a &lt;run&gt; &amp; more") && svg.contains("no data yet") && svg.ends_with("</svg>\n"));
         let more = |k: u64| {
-            let success = if k % 10 == 0 { "1.0" } else { "null" };
-            format!(
-                "{{\"iteration\":{k},\"joint_env_steps\":{},\"success_rate\":{success},\"sampled_success_rate\":0.{k},
-                  \"collisions_per_agent_step\":0.0,\"cost_ratio\":1.0,\"arrival_step\":120.0,\"second_cost_ratio\":null}}\n",
-                1000 + 10_000 * k
-            )
-            .replace("\n                  ", "")
+            let line = json!({
+                "iteration": k, "joint_env_steps": 1000 + 10_000 * k, "sampled_success_rate": k as f64 / 300.0,
+                "success_rate": k.is_multiple_of(10).then_some(0.5), "collisions_per_agent_step": 0.0, "cost_ratio": 1.0,
+                "arrival_step": 120.0, "second_cost_ratio": null,
+            });
+            format!("{line}\n")
         };
         points.extend(parse_metrics(&(1..300).map(more).collect::<String>()).unwrap());
         let svg = curve_svg("run", "", &points).unwrap();
