@@ -2,6 +2,7 @@
 
 pub mod bottleneck;
 mod live_page;
+pub mod means;
 pub mod metrics_file;
 pub mod observer;
 pub(crate) mod shard_timing;

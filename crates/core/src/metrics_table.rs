@@ -10,10 +10,10 @@ use crate::task::{TaskConfig, TaskName};
 pub struct Metric {
     /// Its name on the wire, in files and in TensorBoard.
     pub name: &'static str,
-    /// What the unit counts. Over several episodes every metric is their mean.
-    pub help: &'static str,
     /// Unit of the value.
     pub unit: &'static str,
+    /// What the unit counts. Over several episodes every metric is their mean.
+    pub help: &'static str,
     /// Smallest and largest value that the learner accepts; every value is finite.
     pub range: [f32; 2],
     /// Which tasks have it.
@@ -21,8 +21,16 @@ pub struct Metric {
     /// Its column over an iteration's training episodes (sampled actions), if metrics.jsonl has one. If that column has the
     /// metric's own name, metrics.jsonl does not have the one of the greedy evaluation.
     pub sampled: Option<&'static str>,
-    /// Where and how it is displayed.
-    pub show: Show,
+    /// Heading of its column or plot.
+    pub label: &'static str,
+    /// How tables write a value.
+    pub format: Format,
+    /// Whether `magex train` has a column for it. (`magex eval` has one for every metric of the task.)
+    pub progress: bool,
+    /// Vertical axis of its plot in curve.svg and on the live page, if it has one.
+    pub plot: Option<Scale>,
+    /// Whether a replay lists it beside the episode. (A replay computes arrival and collisions from the states.)
+    pub replay: bool,
 }
 
 /// Which tasks have a metric. A task without it leaves it absent (NaN in an episode, null in JSON) or writes a constant, and
@@ -35,21 +43,6 @@ pub enum Scope {
     Crashes,
     /// Tasks with a second assignment stage.
     SecondStage,
-}
-
-/// Where and how a metric is displayed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Show {
-    /// Heading of its column or plot.
-    pub label: &'static str,
-    /// How a value is written.
-    pub format: Format,
-    /// Whether `magex train` has a column for it. (`magex eval` has one for every metric of the task.)
-    pub progress: bool,
-    /// Vertical axis of its plot in curve.svg and on the live page, if it has one.
-    pub plot: Option<Scale>,
-    /// Whether a replay lists it beside the episode. (A replay computes arrival and collisions from the states.)
-    pub replay: bool,
 }
 
 /// How a value is written.
@@ -74,137 +67,130 @@ pub enum Scale {
     Free,
 }
 
+/// What most rows have in common.
+const SHARE: Metric = Metric {
+    name: "",
+    unit: "share of landmarks",
+    help: "",
+    range: [0.0, 1.0],
+    scope: Scope::EveryTask,
+    sampled: None,
+    label: "",
+    format: Format::Share,
+    progress: false,
+    plot: None,
+    replay: false,
+};
+
 /// Every metric of an episode, in the order of the wire and of metrics.jsonl.
 pub const METRICS: &[Metric] = &[
     Metric {
         name: "success_rate",
         help: "covered at the last step: by an agent within 0.15, by a ball within 0.30 (Push Ball), by a drone within 0.15 \
                that has not crashed",
-        unit: "share of landmarks",
-        range: [0.0, 1.0],
-        scope: Scope::EveryTask,
         sampled: Some("sampled_success_rate"),
-        show: Show { label: "success", format: Format::Share, progress: true, plot: Some(Scale::Share), replay: true },
+        label: "success",
+        progress: true,
+        plot: Some(Scale::Share),
+        replay: true,
+        ..SHARE
     },
     Metric {
         name: "matched_success_rate",
         help: "matched one-to-one to what covers them at the last step; Push Ball: covered by their own ball",
-        unit: "share of landmarks",
-        range: [0.0, 1.0],
-        scope: Scope::EveryTask,
-        sampled: None,
-        show: Show { label: "matched", format: Format::Share, progress: false, plot: None, replay: true },
+        label: "matched",
+        replay: true,
+        ..SHARE
     },
     Metric {
         name: "all_covered_rate",
-        help: "1 if every landmark is covered at the last step, otherwise 0",
         unit: "share of episodes",
-        range: [0.0, 1.0],
-        scope: Scope::EveryTask,
-        sampled: None,
-        show: Show { label: "all covered", format: Format::Share, progress: false, plot: None, replay: false },
+        help: "1 if every landmark is covered at the last step, otherwise 0",
+        label: "all covered",
+        ..SHARE
     },
     Metric {
         name: "arrival_step",
-        help: "first step after which at least 99 % of the landmarks were covered; the horizon + 1 if that never happened",
         unit: "steps",
+        help: "first step after which at least 99 % of the landmarks were covered; the horizon + 1 if that never happened",
         range: [1.0, f32::MAX],
-        scope: Scope::EveryTask,
-        sampled: None,
-        show: Show {
-            label: "arrival",
-            format: Format::Decimals(1),
-            progress: true,
-            plot: Some(Scale::FromZero),
-            replay: false,
-        },
+        label: "arrival",
+        format: Format::Decimals(1),
+        progress: true,
+        plot: Some(Scale::FromZero),
+        ..SHARE
     },
     Metric {
         name: "collisions_per_agent_step",
-        help: "other agents closer than two radii; drones: agents that crashed",
         unit: "per agent and step",
+        help: "other agents closer than two radii; drones: agents that crashed",
         range: [0.0, f32::MAX],
-        scope: Scope::EveryTask,
         sampled: Some("sampled_collisions_per_agent_step"),
-        show: Show {
-            label: "collisions",
-            format: Format::Decimals(4),
-            progress: true,
-            plot: Some(Scale::FromZero),
-            replay: false,
-        },
+        label: "collisions",
+        format: Format::Decimals(4),
+        progress: true,
+        plot: Some(Scale::FromZero),
+        ..SHARE
     },
     Metric {
         name: "collision_rate",
-        help: "crashed; 0 in tasks where nothing crashes",
         unit: "share of agents",
-        range: [0.0, 1.0],
+        help: "crashed; 0 in tasks where nothing crashes",
         scope: Scope::Crashes,
         sampled: Some("sampled_collision_rate"),
-        show: Show {
-            label: "crashed",
-            format: Format::Decimals(4),
-            progress: true,
-            plot: Some(Scale::FromZero),
-            replay: true,
-        },
+        label: "crashed",
+        format: Format::Decimals(4),
+        progress: true,
+        plot: Some(Scale::FromZero),
+        replay: true,
+        ..SHARE
     },
     Metric {
         name: "spawn_success_rate",
         help: "covered before the first step",
-        unit: "share of landmarks",
-        range: [0.0, 1.0],
-        scope: Scope::EveryTask,
-        sampled: None,
-        show: Show { label: "at spawn", format: Format::Share, progress: false, plot: None, replay: true },
+        label: "at spawn",
+        replay: true,
+        ..SHARE
     },
     Metric {
         name: "cost_ratio",
         help: "C_c / C_h, at the start of the episode: summed distance of the commander's assignment over that of the exact \
                one, from agents to their (first) goals",
-        unit: "ratio",
-        range: [0.0, f32::MAX],
-        scope: Scope::EveryTask,
         sampled: Some("sampled_cost_ratio"),
-        show: Show {
-            label: "cost",
-            format: Format::Decimals(4),
-            progress: true,
-            plot: Some(Scale::FromOne),
-            replay: true,
-        },
+        label: "cost",
+        ..COST
     },
     Metric {
         name: "second_cost_ratio",
         help: "C_c / C_h of the second stage, from balls to landmarks; null in tasks with one assignment",
-        unit: "ratio",
-        range: [0.0, f32::MAX],
         scope: Scope::SecondStage,
-        sampled: None,
-        show: Show {
-            label: "second cost",
-            format: Format::Decimals(4),
-            progress: true,
-            plot: Some(Scale::FromOne),
-            replay: true,
-        },
+        label: "second cost",
+        ..COST
     },
     Metric {
         name: "reward",
-        help: "mean reward",
         unit: "per agent and step",
+        help: "mean reward",
         range: [f32::MIN, f32::MAX],
-        scope: Scope::EveryTask,
         sampled: Some("reward"),
-        show: Show {
-            label: "reward",
-            format: Format::Decimals(3),
-            progress: false,
-            plot: Some(Scale::Free),
-            replay: true,
-        },
+        label: "reward",
+        format: Format::Decimals(3),
+        plot: Some(Scale::Free),
+        replay: true,
+        ..SHARE
     },
 ];
+
+/// What both cost ratios have in common.
+const COST: Metric = Metric {
+    unit: "ratio",
+    range: [0.0, f32::MAX],
+    format: Format::Decimals(4),
+    progress: true,
+    plot: Some(Scale::FromOne),
+    replay: true,
+    ..SHARE
+};
 
 /// Row of the metric that decides when a run stops.
 pub const SUCCESS_RATE: usize = row("success_rate");
@@ -262,7 +248,7 @@ impl Metric {
 
     /// A value as tables show it.
     pub fn write(&self, value: f64) -> String {
-        match self.show.format {
+        match self.format {
             Format::Share => share(value),
             Format::Decimals(digits) => format!("{value:.digits$}"),
         }

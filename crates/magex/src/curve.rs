@@ -116,7 +116,7 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
         header.draw_text(subtitle, &text(15).color(&SOFT), (24, 42)).map_err(drawing)?;
         for (index, (metric, scale, series)) in panels.iter().enumerate() {
             let (area, below) = rest.split_vertically(heights[index]);
-            let name = format!("{}, {}", metric.show.label, metric.unit);
+            let name = format!("{}, {}", metric.label, metric.unit);
             panel(&area, &name, *scale, series, last, index + 1 == panels.len())?;
             rest = below;
         }
@@ -127,7 +127,7 @@ pub fn curve_svg(title: &str, subtitle: &str, points: &[MetricsPoint]) -> Result
 
 /// The plot of a metric, if it has one and the run has the metric.
 fn panel_of<'a>(metric: &'a Metric, points: &[MetricsPoint]) -> Option<(&'a Metric, Scale, Vec<Series>)> {
-    let scale = metric.show.plot?;
+    let scale = metric.plot?;
     let sampled = metric.sampled.map(|column| line("sampled, training episodes", BLUE, points, column));
     let greedy = metric.greedy().then(|| line("greedy evaluation", GREEN, points, metric.name));
     let mut series: Vec<Series> = sampled.into_iter().chain(greedy).collect();
@@ -277,6 +277,7 @@ fn drawing(error: impl std::fmt::Display) -> CurveError {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use serde_json::json;
 
     const LINE: &str = r#"{"iteration":0,"joint_env_steps":1000,"success_rate":null,"reward":-1.5,"loss":3}"#;
 
@@ -312,13 +313,12 @@ mod tests {
         let svg = curve_svg("a <run> & more", "N = 5", &points).unwrap();
         assert!(svg.contains("a &lt;run&gt; &amp; more") && svg.contains("no data yet") && svg.ends_with("</svg>\n"));
         let more = |k: u64| {
-            let success = if k % 10 == 0 { "1.0" } else { "null" };
-            format!(
-                "{{\"iteration\":{k},\"joint_env_steps\":{},\"success_rate\":{success},\"sampled_success_rate\":0.{k},
-                  \"collisions_per_agent_step\":0.0,\"cost_ratio\":1.0,\"arrival_step\":120.0,\"second_cost_ratio\":null}}\n",
-                1000 + 10_000 * k
-            )
-            .replace("\n                  ", "")
+            let line = json!({
+                "iteration": k, "joint_env_steps": 1000 + 10_000 * k, "sampled_success_rate": k as f64 / 300.0,
+                "success_rate": k.is_multiple_of(10).then_some(0.5), "collisions_per_agent_step": 0.0, "cost_ratio": 1.0,
+                "arrival_step": 120.0, "second_cost_ratio": null,
+            });
+            format!("{line}\n")
         };
         points.extend(parse_metrics(&(1..300).map(more).collect::<String>()).unwrap());
         let svg = curve_svg("run", "", &points).unwrap();

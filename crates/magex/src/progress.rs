@@ -77,7 +77,7 @@ impl Progress {
     /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
-        let shown = |row: &usize| METRICS[*row].show.progress && METRICS[*row].applies(&config.task);
+        let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
         let metrics = (0..METRICS.len()).filter(shown).collect();
         let terminal = std::io::stderr().is_terminal();
         if !terminal {
@@ -210,13 +210,13 @@ impl Drop for Progress {
 
 /// Width of a metric's column.
 fn width(metric: usize) -> usize {
-    METRICS[metric].show.label.len().max(8)
+    METRICS[metric].label.len().max(8)
 }
 
 fn heading(metrics: &[usize]) -> String {
     let mut text = format!("{:>5} {:>10}", "iter", "steps");
     for &metric in metrics {
-        text += &format!(" {:>1$}", METRICS[metric].show.label, width(metric));
+        text += &format!(" {:>1$}", METRICS[metric].label, width(metric));
         if metric == SUCCESS_RATE {
             text += &format!(" {:>8}", "sampled");
         }

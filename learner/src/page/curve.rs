@@ -30,14 +30,14 @@ const COLUMNS: [(&str, &str); 17] = [
 
 /// The columns of metrics.jsonl for the episode metrics that have a plot.
 fn metric_columns() -> impl Iterator<Item = &'static str> {
-    let plotted = METRICS.iter().filter(|metric| metric.show.plot.is_some());
+    let plotted = METRICS.iter().filter(|metric| metric.plot.is_some());
     plotted.flat_map(|metric| [metric.greedy().then_some(metric.name), metric.sampled]).flatten()
 }
 
 /// The plots of the episode metrics as the page's script draws them, JSON.
 pub(super) fn plots() -> String {
     let plots = METRICS.iter().filter_map(|metric| {
-        let scale = match metric.show.plot? {
+        let scale = match metric.plot? {
             Scale::Share => json!({ "low": 0, "high": 1, "share": true }),
             Scale::FromOne => json!({ "line": 1 }),
             Scale::FromZero | Scale::Free => json!({}),
@@ -45,7 +45,7 @@ pub(super) fn plots() -> String {
         let series =
             [(metric.greedy().then_some(metric.name), "greedy evaluation"), (metric.sampled, "training episodes")];
         let series: Vec<_> = series.iter().filter_map(|(column, title)| column.map(|column| [column, title])).collect();
-        Some(json!({ "name": metric.name, "title": metric.show.label, "scale": scale, "series": series }))
+        Some(json!({ "name": metric.name, "title": metric.label, "scale": scale, "series": series }))
     });
     Value::Array(plots.collect()).to_string()
 }

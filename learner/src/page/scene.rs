@@ -190,10 +190,9 @@ impl Scene {
 
     /// What an episode scored: heading and value of the metrics that a replay lists and the task has.
     pub fn facts(&self, metrics: &EpisodeMetrics) -> Vec<(&'static str, String)> {
-        let listed =
-            METRICS.iter().zip(&self.metrics).enumerate().filter(|(_, (metric, has))| metric.show.replay && **has);
+        let listed = METRICS.iter().zip(&self.metrics).enumerate().filter(|(_, (metric, has))| metric.replay && **has);
         let value = |(row, (metric, _)): (usize, (&Metric, &bool))| {
-            metrics.get(row).map(|value| (metric.show.label, metric.write(value.into())))
+            metrics.get(row).map(|value| (metric.label, metric.write(value.into())))
         };
         listed.filter_map(value).collect()
     }

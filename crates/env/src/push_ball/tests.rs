@@ -183,7 +183,7 @@ fn run(env: &mut PushBall, goals: &[u32], seed: u32, steps: u32, table: impl Fn(
     }
     for score in env.scores() {
         log.push(bits(&[score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE], score[REWARD]]));
-        log.push(bits(&[score[ARRIVAL_STEP], score[COLLISIONS_PER_AGENT_STEP]]));
+        log.push(vec![score[ARRIVAL_STEP] as u32, score[COLLISIONS_PER_AGENT_STEP].to_bits()]);
     }
     log
 }

@@ -11,7 +11,7 @@ use magex_core::ids::Mode;
 use magex_core::metrics_table::METRICS;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
-use magex_learner::report::metrics_file::{EvalSummary, summarise};
+use magex_learner::report::means::{EvalSummary, summarise};
 use magex_runtime::exit;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
@@ -129,7 +129,7 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
     }
 
     let mut means = Map::new();
-    let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.show.label);
+    let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.label);
     let heading: Vec<&str> = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
@@ -141,7 +141,7 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
         if rows.len() > modes.list().len() {
             table.row(cells(&config.task, ["all".into(), String::new()], mode, &summary));
         }
-        means.insert(mode_name(mode).into(), serde_json::to_value(&summary)?);
+        means.insert(mode_name(mode).into(), serde_json::to_value(summary)?);
     }
     output.say(table.to_string());
     note(format!("{} with {threads} threads", seconds(rows.iter().map(|row| row.wall_s).sum())));
@@ -179,7 +179,7 @@ fn cells(task: &TaskConfig, [spawn, seed]: [String; 2], mode: Mode, summary: &Ev
 }
 
 fn value(row: &Row) -> serde_json::Result<Value> {
-    let mut value = serde_json::to_value(&row.summary)?;
+    let mut value = serde_json::to_value(row.summary)?;
     if let Value::Object(map) = &mut value {
         map.insert("seed".into(), json!(row.seed));
         map.insert("mode".into(), json!(mode_name(row.mode)));

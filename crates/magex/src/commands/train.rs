@@ -274,7 +274,7 @@ fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, outpu
     let sampled = METRICS[SUCCESS_RATE].write(s.episodes.sampled_success_rate.unwrap_or_default());
     let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&job.config.task));
     let mut rows: Vec<(&str, String)> = metrics
-        .filter_map(|(metric, mean)| Some((metric.show.label, format!("{} {}", metric.write(mean?), metric.unit))))
+        .filter_map(|(metric, mean)| Some((metric.label, format!("{} {}", metric.write(mean?), metric.unit))))
         .collect();
     rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
     rows.extend([

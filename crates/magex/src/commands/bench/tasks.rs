@@ -85,7 +85,7 @@ pub(super) fn tasks(args: &TasksArgs) -> anyhow::Result<Report> {
     let shown = || METRICS.iter().filter(|metric| metric.greedy());
     let heading: Vec<&str> = ["task", "executor", "measured on", "joint steps", "wall", "worst seed"]
         .into_iter()
-        .chain(shown().map(|metric| metric.show.label))
+        .chain(shown().map(|metric| metric.label))
         .collect();
     let mut report = Report::new("tasks", title, 3, &heading);
     for task in &args.tasks {
