@@ -4,5 +4,4 @@ pub mod adam;
 pub mod batch;
 pub mod commander_ppo;
 pub mod gae;
-pub mod loss;
 pub mod mappo;

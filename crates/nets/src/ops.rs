@@ -2,6 +2,8 @@
 //! several times slower on a CPU (the gradient of a bias alone costs more than its matrix product), and some of
 //! candle-nn's fused layers cut the gradient silently.
 
+mod action_log_probs;
+mod elementwise;
 mod graph;
 mod gru;
 mod linear;
@@ -9,6 +11,8 @@ mod norm;
 mod picks;
 mod pool;
 
+pub use action_log_probs::action_log_probs;
+pub use elementwise::{exp, softmax, tanh};
 pub use graph::{GraphBlock, GraphNoise, graph_block};
 pub use gru::gru;
 pub use linear::linear;

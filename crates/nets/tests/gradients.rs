@@ -1,11 +1,13 @@
 //! Hand-written gradients against finite differences and against candle's own automatic differentiation.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+#![allow(clippy::disallowed_methods, reason = "candle's own functions are what ours are compared with")]
 
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_nets::Activation;
+use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{Input, build, feature_spec, memory};
 use magex_nets::features::JointStates;
 use magex_nets::ops::{self, GraphBlock, GraphNoise};
@@ -55,7 +57,7 @@ fn check(vars: &[&Var], f: &dyn Fn() -> Tensor) {
 #[test]
 fn linear_and_norm() {
     let (x, w, b) = (var(&[6, 5], 1), var(&[5, 7], 2), var(&[7], 3));
-    for act in [Activation::Identity, Activation::Tanh] {
+    for act in [Activation::Identity, Activation::Relu, Activation::Tanh] {
         check(&[&x, &w, &b], &|| ops::linear(&x, &w, &b, act, false).unwrap());
     }
     let (scale, shift) = (var(&[5], 4), var(&[5], 5));
@@ -77,6 +79,55 @@ fn neighbour_pool() {
     let counts = Arc::new(vec![3, 0, 1, 2, 3]);
     let (w, b) = (var(&[4, 20], 2), var(&[20], 3));
     check(&[&w, &b], &|| ops::neighbour_pool(&features, counts.clone(), &w, &b).unwrap());
+}
+
+#[test]
+fn log_probabilities_of_actions_match_autodiff_and_have_the_bits_of_the_choice() {
+    let heads = ActionHeads::new(vec![5, 3, 1]).unwrap();
+    let (rows, logits) = (7, var(&[7, 9], 1));
+    let mut stream = Key::new(1, Purpose::Action, &[]).stream();
+    let (mut actions, mut chosen) = (vec![0; rows * 3], Vec::new());
+    let values = logits.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    for (logits, action) in values.chunks_exact(9).zip(actions.chunks_exact_mut(3)) {
+        chosen.push(heads.choose(logits, Some(&mut stream), action));
+    }
+    let ours = || ops::action_log_probs(&logits, actions.clone(), &heads).unwrap();
+    assert_eq!(ours().get(0).unwrap().to_vec1::<f32>().unwrap(), chosen);
+    check(&[&logits], &ours);
+    // The same with candle's own operations.
+    let zeros = || Tensor::zeros(rows, DType::F32, &Device::Cpu).unwrap();
+    let (mut log_prob, mut entropy) = (zeros(), zeros());
+    let mut at = 0;
+    for (component, &size) in heads.sizes().iter().enumerate() {
+        let log_probs = candle_nn::ops::log_softmax(&logits.narrow(1, at, size).unwrap(), 1).unwrap();
+        let choice: Vec<u32> = actions.iter().skip(component).step_by(3).map(|&a| a.into()).collect();
+        let choice = Tensor::from_vec(choice, (rows, 1), &Device::Cpu).unwrap();
+        log_prob = (log_prob + log_probs.gather(&choice, 1).unwrap().squeeze(1).unwrap()).unwrap();
+        entropy = (entropy - (log_probs.exp().unwrap() * &log_probs).unwrap().sum(1).unwrap()).unwrap();
+        at += size;
+    }
+    let theirs = Tensor::stack(&[&log_prob, &entropy], 0).unwrap();
+    let largest = |x: Tensor| x.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(largest((ours() - &theirs).unwrap()) < 1e-5);
+    let gradient = |y: &Tensor| probe(y).backward().unwrap().get(&logits).unwrap().clone();
+    assert!(largest((gradient(&ours()) - gradient(&theirs)).unwrap()) < 1e-5);
+    assert!(ops::action_log_probs(&logits, vec![9; rows * 3], &heads).is_err());
+}
+
+#[test]
+fn exp_tanh_and_softmax() {
+    let x = var(&[3, 21], 1);
+    for f in [ops::exp, ops::tanh, ops::softmax] {
+        check(&[&x], &|| f(&x).unwrap());
+    }
+    let special = Tensor::new(&[0.0, f32::NAN, 200.0, -200.0, f32::INFINITY, f32::NEG_INFINITY], &Device::Cpu).unwrap();
+    let y = ops::exp(&special).unwrap().to_vec1::<f32>().unwrap();
+    // A loss that is not finite must stay so: the update is skipped for it.
+    assert!(y[0] == 1.0 && y[1].is_nan() && y[2..] == [f32::INFINITY, 0.0, f32::INFINITY, 0.0], "{y:?}");
+    let theirs = x.exp().unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    for (a, b) in ops::exp(&x).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap().into_iter().zip(theirs) {
+        assert!((a - b).abs() <= 3e-7 * b, "{a} and {b}");
+    }
 }
 
 /// The graph block written with candle's operations: one joint state, straight-through by detach.

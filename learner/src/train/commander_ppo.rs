@@ -9,6 +9,7 @@ mod imitation;
 mod tests;
 
 use crate::train::adam::Adam;
+use crate::train::mappo::clipped_surrogate;
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::CommanderConfig;
 use magex_core::keys::random_goals;
@@ -16,7 +17,7 @@ use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Group, Stage, TaskConfig};
 use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
-use magex_nets::ops::Pick;
+use magex_nets::ops::{self, Pick};
 use magex_nets::params::Params;
 
 pub use imitation::Lesson;
@@ -171,9 +172,8 @@ impl CommanderPpo {
                     .collect();
                 let (old, advantage) =
                     (Tensor::from_vec(old, rows, &Device::Cpu)?, Tensor::from_vec(advantage, rows, &Device::Cpu)?);
-                let ratio = (now.get(0)? - old)?.exp()?;
-                let (low, high) = (f64::from(1.0 - c.clip), f64::from(1.0 + c.clip));
-                let surrogate = (&ratio * &advantage)?.minimum(&(ratio.clamp(low, high)? * &advantage)?)?;
+                let ratio = ops::exp(&(now.get(0)? - old)?)?;
+                let surrogate = clipped_surrogate(&ratio, &advantage, c.clip)?;
                 let mean = |x: Tensor| -> candle_core::Result<Tensor> { x.sum_all()?.affine(1.0 / rows as f64, 0.0) };
                 let (surrogate, entropy) = (mean(surrogate)?, mean(now.get(1)?)?);
                 let loss = (surrogate.neg()? - (&entropy * f64::from(c.entropy))?)?;

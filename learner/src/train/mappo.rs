@@ -7,14 +7,13 @@
 use crate::train::adam::Adam;
 use crate::train::batch::Batch;
 use crate::train::gae::{Gae, ValueNorm};
-use crate::train::loss::{PolicyRows, PolicyStats, ValueRows, policy_loss, value_loss};
-use candle_core::{Result, Tensor, Var};
+use candle_core::{Device, Result, Tensor, Var};
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{self, Input, Network};
 use magex_nets::features::FeatureSpec;
-use magex_nets::ops::GraphNoise;
+use magex_nets::ops::{self, GraphNoise};
 use magex_nets::params::{ParamError, Params, Source};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -321,25 +320,21 @@ impl Mappo {
         data: &ShardData<'_>,
         advantages: &[f32],
     ) -> std::result::Result<(Vec<f32>, PolicyStats, f64), ParamError> {
-        let batch = data.batch;
-        let rows = PolicyRows {
-            actions: batch.rows(&batch.actions, batch.shape.action_components, data.units, self.chunk),
-            old_log_probs: batch.rows(&batch.log_probs, 1, data.units, self.chunk),
-            advantages: batch.rows(advantages, 1, data.units, self.chunk),
-        };
+        let (batch, m) = (data.batch, &self.config.mappo);
+        let row = |values: &[f32]| column(batch.rows(values, 1, data.units, self.chunk));
+        let actions = batch.rows(&batch.actions, batch.shape.action_components, data.units, self.chunk);
+        let (old_log_probs, advantages) = (row(&batch.log_probs)?, row(advantages)?);
         let noise = GraphNoise::Keyed(Arc::new(batch.noise_keys(data.units, self.chunk)));
         let mut stats = PolicyStats::default();
         let gradient = self.gradient(Role::Actor, &state.actor, data, noise, |logits| {
-            let (loss, s) = policy_loss(
-                logits,
-                rows,
-                &self.heads,
-                self.config.mappo.clip_epsilon,
-                self.config.mappo.entropy_coef,
-                data.scale,
-            )?;
-            stats = s;
-            Ok(loss)
+            let now = ops::action_log_probs(logits, actions, &self.heads)?;
+            let (log_probs, entropy) = (now.get(0)?, now.get(1)?);
+            let log_ratio = (log_probs - old_log_probs)?;
+            let ratio = ops::exp(&log_ratio)?;
+            let surrogate = clipped_surrogate(&ratio, &advantages, m.clip_epsilon)?;
+            stats = PolicyStats::of(&surrogate, &entropy, &ratio, &log_ratio, m.clip_epsilon)?;
+            // Scaled by the rows of the whole minibatch, so that the gradients of its slices add up.
+            (surrogate + (entropy * f64::from(m.entropy_coef))?)?.sum_all()? * -f64::from(data.scale)
         })?;
         Ok((gradient, stats, 0.0))
     }
@@ -357,13 +352,15 @@ impl Mappo {
         let batch = data.batch;
         let mut targets = batch.rows(returns, 1, data.units, self.chunk);
         targets.iter_mut().for_each(|r| *r = (*r - mean) / deviation);
-        let rows = ValueRows { old_values: batch.rows(old_values, 1, data.units, self.chunk), targets };
+        let old_values = column(batch.rows(old_values, 1, data.units, self.chunk))?;
+        let targets = column(targets)?;
         let mut total = 0.0;
         let m = &self.config.mappo;
         let gradient = self.gradient(Role::Critic, &state.critic, data, GraphNoise::Off, |values| {
-            let (loss, sum) = value_loss(values, rows, m.clip_epsilon, m.huber_delta, data.scale)?;
-            total = sum;
-            Ok(loss)
+            let values = values.flatten_all()?;
+            let loss = clipped_value_loss(&values, &old_values, &targets, m.clip_epsilon, m.huber_delta)?;
+            total = sum(&loss)?;
+            loss.sum_all()? * f64::from(data.scale)
         })?;
         Ok((gradient, PolicyStats::default(), total))
     }
@@ -401,6 +398,58 @@ impl Mappo {
         }
         Ok(flat)
     }
+}
+
+/// min(ρ A, clip(ρ, 1 ± ε) A), element by element.
+pub(crate) fn clipped_surrogate(ratio: &Tensor, advantages: &Tensor, clip: f32) -> Result<Tensor> {
+    let clipped = (ratio.clamp(1.0 - clip, 1.0 + clip)? * advantages)?;
+    (ratio * advantages)?.minimum(&clipped)
+}
+
+/// max( hub(y − V_c), hub(y − V) ) with V_c = V_old + clip(V − V_old, ± ε), element by element.
+fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32, delta: f32) -> Result<Tensor> {
+    let clipped = (old + (values - old)?.clamp(-clip, clip)?)?;
+    huber(&(targets - values)?, delta)?.maximum(&huber(&(targets - clipped)?, delta)?)
+}
+
+/// e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond, element by element.
+fn huber(error: &Tensor, delta: f32) -> Result<Tensor> {
+    let size = error.abs()?;
+    let inner = size.minimum(delta)?;
+    let outer = ((size - &inner)? * f64::from(delta))?;
+    (inner.sqr()? * 0.5)? + outer
+}
+
+/// What the policy loss saw, summed over rows in double precision.
+#[derive(Debug, Clone, Copy, Default)]
+struct PolicyStats {
+    loss: f64,
+    entropy: f64,
+    clipped: f64,
+    divergence: f64,
+    ratio_error: f64,
+}
+
+impl PolicyStats {
+    fn of(surrogate: &Tensor, entropy: &Tensor, ratio: &Tensor, log_ratio: &Tensor, clip: f32) -> Result<Self> {
+        let mut stats = Self { loss: -sum(surrogate)?, entropy: sum(entropy)?, ..Self::default() };
+        for (ratio, log_ratio) in ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?) {
+            stats.clipped += f64::from(u8::from((ratio - 1.0).abs() > clip));
+            stats.divergence += f64::from(ratio - 1.0 - log_ratio);
+            stats.ratio_error = stats.ratio_error.max(f64::from((ratio - 1.0).abs()));
+        }
+        Ok(stats)
+    }
+}
+
+fn column(values: Vec<f32>) -> Result<Tensor> {
+    let rows = values.len();
+    Tensor::from_vec(values, rows, &Device::Cpu)
+}
+
+/// Σ in order, in double precision.
+fn sum(values: &Tensor) -> Result<f64> {
+    Ok(values.to_vec1::<f32>()?.into_iter().map(f64::from).sum())
 }
 
 /// One shard of a minibatch.
@@ -463,3 +512,6 @@ fn last_state(states: Option<&Tensor>, otherwise: Vec<f32>) -> Result<Vec<f32>> 
         None => Ok(otherwise),
     }
 }
+
+#[cfg(test)]
+mod tests;

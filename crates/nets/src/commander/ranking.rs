@@ -8,6 +8,7 @@ use super::instance::Turns;
 use super::{CommanderError, Instance, Team, constant};
 use crate::executor::Layer;
 use crate::matmul::Activation;
+use crate::ops;
 use crate::params::{ParamError, Source};
 use candle_core::{Result as CandleResult, Tensor};
 use magex_core::config::CanonicalOrder;
@@ -52,7 +53,7 @@ impl RankingNet {
         let x = constant(features, 2 * self.dims * self.agents)?;
         let hidden = self.layers[1].forward(&self.layers[0].forward_constant(&x)?)?;
         let raw = self.layers[2].forward(&hidden)?;
-        (raw * (1.0 / BOUND))?.tanh()?.affine(BOUND, 0.0)?.flatten_all()
+        ops::tanh(&(raw * (1.0 / BOUND))?)?.affine(BOUND, 0.0)?.flatten_all()
     }
 
     /// Positions relative to their centre, divided by their largest extent, in canonical order.

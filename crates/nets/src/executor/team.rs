@@ -3,9 +3,9 @@
 use super::{Input, Layer, Network, Output, RELU_GAIN, constant};
 use crate::features::FeatureSpec;
 use crate::matmul::Activation;
-use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others, neighbour_pool};
+use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others, neighbour_pool, softmax};
 use crate::params::{ParamError, Source, Start};
-use candle_core::{D, DType, Device, Result as CandleResult, Tensor};
+use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use std::sync::Arc;
 
@@ -200,7 +200,7 @@ impl TeamNet {
                 let (q, k, v) = (part(0)?, part(1)?, part(2)?);
                 let scale = 1.0 / (HEAD_WIDTH as f64).sqrt();
                 let weights = (q.matmul(&k.transpose(2, 3)?.contiguous()?)? * scale)?;
-                let mixed = candle_nn::ops::softmax(&weights, D::Minus1)?.matmul(&v)?;
+                let mixed = softmax(&weights)?.matmul(&v)?;
                 out.forward(&mixed.transpose(1, 2)?.contiguous()?.reshape((states * n, inner))?)
             }
             Team::Concat { mix } => {
