@@ -5,7 +5,7 @@ use crate::checkpoint::Progress;
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::report::bottleneck::{Bound, Collected, judge};
 use crate::train::commander_ppo::CommanderStats;
-use crate::train::mappo::UpdateStats;
+use crate::train::stats::UpdateStats;
 use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::EpisodeMetrics;
@@ -181,8 +181,8 @@ impl IterationMetrics {
             sampled_collision_rate: train(|e| e.collision_rate),
             sampled_cost_ratio: train(|e| e.cost_ratio),
             reward: train(|e| e.reward),
+            commander: updates.as_ref().map(|u| u.1),
             executor: updates.map(|u| u.0),
-            commander: updates.map(|u| u.1),
             timing,
             joint_steps_per_s: steps / seconds.max(1e-9),
             wall_s,

@@ -158,8 +158,8 @@ impl LearnerGauges {
         for (by, seconds) in BoundBy::ALL.iter().zip([bound.actor_s, bound.learner_s, bound.network_s]) {
             self.bound_seconds.with(&[by.name()]).set(seconds);
         }
-        if let Some(update) = &metrics.executor {
-            self.skipped.add(update.skipped as u64);
+        if let Some(skipped) = metrics.executor.as_ref().and_then(|update| update.get("skipped_minibatches")) {
+            self.skipped.add(skipped as u64);
         }
         if let Some(success) = metrics.success_rate {
             self.success.set(success);

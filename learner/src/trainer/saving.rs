@@ -87,13 +87,8 @@ impl Trainer {
     pub(super) fn checkpoint(&mut self) -> Result<PathBuf, TrainError> {
         // A checkpoint that survives a power cut has the lines of its iterations.
         self.metrics.sync();
-        let (e, c) = (&self.learned.executor, &self.learned.commander);
-        let progress = Progress {
-            value_norm: e.value_norm,
-            adam_steps: [e.actor_adam.steps, e.critic_adam.steps, c.adam.steps],
-            wall_s: self.progress.wall_s + self.started.elapsed().as_secs_f64(),
-            ..self.progress.clone()
-        };
+        let progress =
+            Progress { wall_s: self.progress.wall_s + self.started.elapsed().as_secs_f64(), ..self.progress.clone() };
         Ok(checkpoint::write(&self.folder, &progress, &self.learned, self.config.run.keep_checkpoints)?)
     }
 }

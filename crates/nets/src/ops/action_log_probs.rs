@@ -1,6 +1,6 @@
-use super::{slice, with_numbers};
+use super::simd::load;
+use super::{slice, with_values};
 use crate::distribution::ActionHeads;
-use crate::simd::{load};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use std::sync::OnceLock;
 
@@ -60,7 +60,7 @@ impl CustomOp1 for ActionLogProbs {
     fn bwd(&self, logits: &Tensor, _out: &Tensor, upstream: &Tensor) -> Result<Option<Tensor>> {
         let (rows, width) = logits.dims2()?;
         let Some(saved) = self.saved.get() else { bail!("action log-probs: gradient without forward") };
-        let gradient = with_numbers(&upstream.contiguous()?, |upstream| {
+        let gradient = with_values(&upstream.contiguous()?, |upstream| {
             let (d_log_probs, d_entropies) = upstream.split_at(rows);
             let mut gradient = vec![0.0; rows * width];
             for (((gradient, saved), action), (d_log_prob, d_entropy)) in gradient

@@ -1,5 +1,5 @@
-use super::{numbers, slice};
-use crate::simd::{self, LANES, load, store};
+use super::simd::{self, LANES, load, store};
+use super::{slice, values};
 use candle_core::{CpuStorage, CustomOp1, D, Layout, Result, Shape, Tensor};
 use wide::f32x16;
 
@@ -47,8 +47,8 @@ impl CustomOp1 for Elementwise {
     }
 
     fn bwd(&self, _x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let mut dx = numbers(dy)?;
-        for (d, y) in dx.iter_mut().zip(numbers(y)?) {
+        let mut dx = values(dy)?;
+        for (d, y) in dx.iter_mut().zip(values(y)?) {
             *d *= match self {
                 Self::Exp => y,
                 Self::Tanh => 1.0 - y * y,

@@ -1,7 +1,6 @@
 use super::*;
-use candle_core::Var;
+use candle_core::Device;
 use magex_nets::distribution::ActionHeads;
-use magex_nets::ops;
 
 /// The gradient of a scalar against finite differences, entry by entry.
 fn check(start: &[f32], shape: &[usize], f: &dyn Fn(&Tensor) -> Tensor) {
