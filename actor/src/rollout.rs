@@ -1,24 +1,23 @@
 //! Rolling out a shard: a pure function of the shard, the run's seed and task, the weights it names, and the goals that
 //! the commander hands out. Nothing here knows a clock, a thread or an address.
 
+mod policy;
+
+use self::policy::{Carried, KeyedChooser};
 use magex_core::config::RunConfig;
-use magex_core::ids::{Mode, Shard, ShardKind};
+use magex_core::ids::{Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
-use magex_core::rng::{Key, Purpose, Stream, sequence};
 use magex_core::task::{ActionCode, Group, Stage};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_env::scripted::scripted;
 use magex_env::{Env, EnvError, View, new_env};
-use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{self, Input, Network};
-use magex_nets::features::{FeatureSpec, Features, JointStates, Symmetry};
-use magex_nets::ops::GraphNoise;
-use magex_nets::params::{ParamError, Params, Source, from_safetensors};
+use magex_nets::executor::{Model, Policy};
+use magex_nets::features::{JointStates, Symmetry};
+use magex_nets::params::ParamError;
 use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
-use std::sync::Arc;
 
-/// Why a shard could not be rolled out. E is the error of the goal source.
+/// Why a shard could not be rolled out. E is the error of the commander's client.
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError<E> {
     /// The environment refused.
@@ -44,8 +43,8 @@ pub enum RolloutError<E> {
 
 /// What drives the agents.
 enum Driver {
-    /// The executor's actor network.
-    Policy(Box<dyn Network>),
+    /// The executor's policy.
+    Policy(Box<dyn Policy>),
     /// The scripted controller: thrust that brings the predicted stopping point closest to the goal. A yardstick.
     Scripted,
 }
@@ -53,8 +52,7 @@ enum Driver {
 /// Everything that is the same for all shards of a version of the weights.
 pub struct Roller {
     config: RunConfig,
-    spec: FeatureSpec,
-    heads: ActionHeads,
+    model: Model,
     driver: Driver,
 }
 
@@ -65,30 +63,17 @@ impl std::fmt::Debug for Roller {
 }
 
 impl Roller {
-    /// With the actor network of a safetensors file (`actor.…`). `config.task` may have another team size than the one
-    /// the weights were trained with, if the architecture allows it.
+    /// With the policy of a weights file. `config.task` may have another team size than the one the weights were trained
+    /// with, if the architecture allows it.
     pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
-        let spec = executor::feature_spec(&config.executor, &config.task);
-        let heads = heads(config)?;
-        let build = |source: &mut Source<'_>| {
-            executor::build(&config.executor, &spec, config.task.agents, heads.logits(), 0.01, source)
-        };
-        // The layout is that of a network drawn for this configuration; its numbers come from the file.
-        let mut source = Source::new(Key::new(0, Purpose::Init, &[0]).stream());
-        build(&mut source)?;
-        let mut params = match source {
-            Source::New { params, .. } => params,
-            Source::Existing { .. } => Params::default(),
-        };
-        from_safetensors(weights, "actor", &mut params)?;
-        let network = build(&mut params.source(params.plain()?))?;
-        Ok(Self { config: config.clone(), spec, heads, driver: Driver::Policy(network) })
+        let model = Model::new(config)?;
+        let driver = Driver::Policy(model.load_policy(weights)?);
+        Ok(Self { config: config.clone(), model, driver })
     }
 
     /// With the scripted controller instead of a policy (evaluation only).
     pub fn scripted(config: &RunConfig) -> Result<Self, ParamError> {
-        let spec = executor::feature_spec(&config.executor, &config.task);
-        Ok(Self { config: config.clone(), spec, heads: heads(config)?, driver: Driver::Scripted })
+        Ok(Self { config: config.clone(), model: Model::new(config)?, driver: Driver::Scripted })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -114,10 +99,9 @@ impl Roller {
 
         let mut out = columns(&shape, shard, keep);
         let mut recording = (Vec::new(), Vec::new());
-        let mut actions = vec![0u8; b * n * shape.action_components];
-        let (mut log_probs, mut rewards) = (vec![0.0; b * n], vec![0.0; b * n]);
-        let mut policy = Policy::new(self, shard, b, &keys.iter().map(|k| k.graph).collect::<Vec<_>>());
-        let mut streams: Vec<Stream> = keys.iter().map(|k| k.action.stream()).collect();
+        let mut rewards = vec![0.0; b * n];
+        let mut chosen = KeyedChooser::new(self.model.heads(), n, shard.mode, keys.iter().map(|k| k.action));
+        let mut carried = Carried::new(&self.model, shard, n, keys.iter().map(|k| k.graph));
         for step in 0..=steps {
             state.read(worlds.as_ref())?;
             if keep {
@@ -133,33 +117,24 @@ impl Roller {
             }
             let mut symmetries: Vec<Symmetry> = Vec::new();
             match &self.driver {
-                Driver::Policy(network) => {
-                    let features = self.spec.compute(&state.joint_states());
-                    let logits = policy.logits(network.as_ref(), &features, step).map_err(ParamError::from)?;
-                    if let Some(place) = logits.iter().position(|x| !x.is_finite()) {
+                Driver::Policy(policy) => {
+                    let features = self.model.spec().compute(&state.joint_states());
+                    carried.act(policy.as_ref(), &features, step, &mut chosen).map_err(ParamError::from)?;
+                    if let Some(place) = chosen.not_finite {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
-                    }
-                    let width = self.heads.logits();
-                    for row in 0..b * n {
-                        let stream = (shard.mode == Mode::Sampled).then_some(&mut streams[row / n]);
-                        log_probs[row] = self.heads.choose(
-                            &logits[row * width..(row + 1) * width],
-                            stream,
-                            &mut actions[row * shape.action_components..(row + 1) * shape.action_components],
-                        );
                     }
                     symmetries = features.symmetries;
                 }
-                Driver::Scripted => scripted(task, &state.view(), &mut actions)?,
+                Driver::Scripted => scripted(task, &state.view(), &mut chosen.actions)?,
             }
             if keep {
-                out.actions.extend_from_slice(&actions);
+                out.actions.extend_from_slice(&chosen.actions);
             }
             // The policy chose in each agent's own frame.
-            to_world(task.action_code(), shape.action_components, &symmetries, &mut actions);
-            worlds.step(&actions, &mut rewards)?;
+            to_world(task.action_code(), shape.action_components, &symmetries, &mut chosen.actions);
+            worlds.step(&chosen.actions, &mut rewards)?;
             if keep {
-                out.log_probs.extend_from_slice(&log_probs);
+                out.log_probs.extend_from_slice(&chosen.log_probs);
                 out.rewards.extend_from_slice(&rewards);
             }
         }
@@ -323,49 +298,4 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         exact_costs: Vec::new(),
         metrics: Vec::new(),
     }
-}
-
-/// The memory and the noise of a batch of episodes.
-struct Policy {
-    hidden: Vec<f32>,
-    noise: Option<Vec<u64>>,
-    episodes: usize,
-    agents: usize,
-}
-
-impl Policy {
-    fn new(roller: &Roller, shard: &Shard, episodes: usize, graph: &[Key]) -> Self {
-        let agents = roller.config.task.agents;
-        let memory = match &roller.driver {
-            Driver::Policy(network) => network.memory(),
-            Driver::Scripted => 0,
-        };
-        let noise = (shard.mode == Mode::Sampled).then(|| graph.iter().map(|key| key.stream().bits64()).collect());
-        Self { hidden: vec![0.0; episodes * agents * memory], noise, episodes, agents }
-    }
-
-    /// [B·N, A] logits of one joint step; the memory moves on.
-    fn logits(&mut self, network: &dyn Network, features: &Features, step: usize) -> candle_core::Result<Vec<f32>> {
-        let noise = match &self.noise {
-            Some(bases) => GraphNoise::Keyed(Arc::new(bases.iter().map(|&base| sequence(base, step as u32)).collect())),
-            None => GraphNoise::Off,
-        };
-        let output = network.forward(&Input {
-            steps: 1,
-            sequences: self.episodes,
-            agents: self.agents,
-            features,
-            hidden: std::mem::take(&mut self.hidden),
-            noise,
-        })?;
-        if let Some(states) = output.states {
-            self.hidden = states.flatten_all()?.to_vec1()?;
-        }
-        output.out.flatten_all()?.to_vec1()
-    }
-}
-
-fn heads(config: &RunConfig) -> Result<ActionHeads, ParamError> {
-    ActionHeads::new(config.task.action_heads())
-        .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))
 }

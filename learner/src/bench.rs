@@ -1,9 +1,10 @@
 //! How long an update takes, for the command line. The clock decides nothing but the number that is reported.
 
 use crate::train::batch::Batch;
+use crate::train::learned::Learned;
 use crate::train::mappo::Mappo;
 use crate::trainer::TrainError;
-use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
 use magex_core::trajectory::Trajectory;
@@ -30,7 +31,7 @@ pub struct MinibatchTime {
 pub fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<MinibatchTime, TrainError> {
     let mut config = config.clone();
     let n = config.task.agents;
-    let chunk = if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk_length };
+    let chunk = Mappo::new(&config)?.chunk();
     let units = (config.mappo.minibatch_size / (chunk * n)).max(1);
     // One episode is one minibatch.
     config.task.horizon = (units * chunk) as u32;
@@ -43,10 +44,10 @@ pub fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Resul
             for (epochs, times) in (1u32..).zip(&mut time) {
                 config.mappo.epochs = epochs;
                 let mappo = Mappo::new(&config)?;
-                let mut state = mappo.start()?;
+                let mut learned = Learned { networks: mappo.init()?, value_norm: mappo.value_norm() };
                 let batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
                 let clock = Instant::now();
-                mappo.update(&mut state, &batch, 0, 0.0)?;
+                mappo.update(&mut learned, &batch, 0, 0.0)?;
                 // The first round warms the caches.
                 if round > 0 {
                     times.push(clock.elapsed().as_secs_f64() * 1e3);
@@ -80,7 +81,7 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
     let (positions, velocities) = (within(half, state), within(1.0, state));
     let (landmarks, rewards) = (within(half, b * n * shape.dims), within(1.0, t * b * n));
     let choices = config.task.action_heads();
-    let uniform: f64 = choices.iter().map(|&c| -(c as f64).ln()).sum();
+    let uniform: f64 = choices.iter().map(|&c| -libm::log(c as f64)).sum();
     Trajectory {
         shard: Shard {
             kind: ShardKind::Train,
@@ -114,6 +115,7 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use magex_core::config::ExecutorKind;
     use magex_core::task::{Spawn, TaskConfig};
 
     #[test]

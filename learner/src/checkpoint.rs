@@ -1,30 +1,30 @@
 //! Checkpoints: everything that learning changes, written so that a kill at any byte leaves the previous one usable.
 //!
-//! A checkpoint is a folder `checkpoints/<iteration>` with `weights.safetensors` (actor, critic, commander),
-//! `optimiser.safetensors` (Adam moments), `state.json` (counters, value statistics) and, written last, `manifest.json`
+//! A checkpoint is a folder `checkpoints/<iteration>` with `weights.safetensors` (every network of [`Learned`]),
+//! `optimiser.safetensors` (its Adam moments), `state.json` (counters, value statistics) and, written last, `manifest.json`
 //! with the SHA-256 of each. It is written under a temporary name, flushed to disk, and renamed.
 
 pub mod disk;
 
 use self::disk::{Disk, FileSystem};
 use crate::train::adam::Adam;
-use crate::train::commander_ppo::CommanderState;
 use crate::train::gae::ValueNorm;
-use crate::train::mappo::ExecutorState;
-use magex_nets::params::{ParamError, Params, from_safetensors, to_safetensors};
+use crate::train::learned::{Learned, Network};
+use magex_nets::params::{ParamError, Params, to_safetensors};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Format of the folder; readers refuse any other.
-pub const FORMAT: u32 = 1;
+/// Format of the folder; readers reject any other.
+pub const FORMAT: u32 = 2;
+const FIRST_FORMAT: u32 = 1;
 
 /// Why a checkpoint could not be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// The file system refused.
+    /// The file system returned an error.
     #[error("checkpoint {path}: {error}")]
     Io {
         /// Which file or folder.
@@ -45,7 +45,8 @@ pub enum CheckpointError {
     Weights(#[from] ParamError),
     /// Another release wrote it.
     #[error(
-        "checkpoint {path}: its format is {format}, this release reads format {FORMAT}; resume with the release that wrote it"
+        "checkpoint {path}: format {format}, written by {writer}, which reads it; this is magex {VERSION}, which reads format {FORMAT}: resume with the release that wrote it, or start the run anew with another --out",
+        writer = writer(*format)
     )]
     Format {
         /// Which folder.
@@ -70,12 +71,20 @@ pub enum CheckpointError {
     None(PathBuf),
 }
 
-/// Counters and statistics of a run.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The release that writes a format.
+fn writer(format: u32) -> &'static str {
+    match format {
+        FIRST_FORMAT => "magex 0.1.0 (commit 389f705)",
+        _ => "another release of magex",
+    }
+}
+
+/// Counters of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
-    /// Format of the checkpoint.
-    pub format: u32,
     /// Identity of the run.
     pub run_id: String,
     /// Fingerprint of the effective configuration.
@@ -88,48 +97,31 @@ pub struct Progress {
     pub on_target: u32,
     /// Seconds spent before this checkpoint, over all processes of the run.
     pub wall_s: f64,
-    /// Running statistics of returns.
-    pub value_norm: ValueNorm,
-    /// Updates of each optimiser: actor, critic, commander.
-    pub adam_steps: [u64; 3],
 }
 
-/// Everything that learning changes.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Learned {
-    /// Actor, critic, their optimisers, value statistics.
-    pub executor: ExecutorState,
-    /// Scheduler and its optimiser.
-    pub commander: CommanderState,
+/// state.json: what learning changes beside weights and moments, and the counters.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    format: u32,
+    progress: Progress,
+    value_norm: ValueNorm,
+    /// Updates of each network's optimiser.
+    adam_steps: BTreeMap<String, u64>,
 }
 
-impl Learned {
-    /// The weights file: all networks. Its SHA-256 is the identity of what was learned.
-    pub fn weights(&self) -> Result<Vec<u8>, ParamError> {
-        let (e, c) = (&self.executor, &self.commander);
-        to_safetensors(&[("actor", &e.actor), ("critic", &e.critic), ("commander", &c.params)], "{\"format\":1}")
-    }
-
-    /// What actors and commanders need: everything but the critic.
-    pub fn broadcast(&self) -> Result<Vec<u8>, ParamError> {
-        to_safetensors(&[("actor", &self.executor.actor), ("commander", &self.commander.params)], "{\"format\":1}")
-    }
-
-    fn moments(&self) -> Result<Vec<u8>, ParamError> {
-        let (e, c) = (&self.executor, &self.commander);
-        let with =
-            |params: &Params, numbers: &[f32]| Params { entries: params.entries.clone(), numbers: numbers.to_vec() };
-        let sets = [
-            ("actor.first", with(&e.actor, &e.actor_adam.first)),
-            ("actor.second", with(&e.actor, &e.actor_adam.second)),
-            ("critic.first", with(&e.critic, &e.critic_adam.first)),
-            ("critic.second", with(&e.critic, &e.critic_adam.second)),
-            ("commander.first", with(&c.params, &c.adam.first)),
-            ("commander.second", with(&c.params, &c.adam.second)),
-        ];
-        let named: Vec<(&str, &Params)> = sets.iter().map(|(name, params)| (*name, params)).collect();
-        to_safetensors(&named, "{\"format\":1}")
-    }
+/// The Adam moments of every network: `<network>.first.…` and `<network>.second.…`.
+fn moments(learned: &Learned) -> Result<Vec<u8>, ParamError> {
+    let with = |network: &Network, which: &str, values: &[f32]| {
+        let params = Params { entries: network.params.entries.clone(), values: values.to_vec() };
+        (format!("{}.{which}", network.name), params)
+    };
+    let of = |network: &Network| {
+        [with(network, "first", &network.adam.first), with(network, "second", &network.adam.second)]
+    };
+    let sets: Vec<(String, Params)> = learned.networks.iter().flat_map(of).collect();
+    let named: Vec<(&str, &Params)> = sets.iter().map(|(name, params)| (name.as_str(), params)).collect();
+    to_safetensors(&named, "{\"format\":1}")
 }
 
 /// SHA-256 in lower-case hex.
@@ -215,9 +207,15 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
         disk.remove_dir(folder).map_err(io(folder))?;
     }
     disk.create_dir(folder).map_err(io(folder))?;
-    let state = serde_json::to_vec_pretty(progress).map_err(|e| unwritable("state.json", e))?;
+    let state = State {
+        format: FORMAT,
+        progress: progress.clone(),
+        value_norm: learned.value_norm,
+        adam_steps: learned.networks.iter().map(|network| (network.name.clone(), network.adam.steps)).collect(),
+    };
+    let state = serde_json::to_vec_pretty(&state).map_err(|e| unwritable("state.json", e))?;
     let mut contents: Vec<(&str, Vec<u8>)> =
-        FILES.into_iter().zip([learned.weights()?, learned.moments()?, state]).collect();
+        FILES.into_iter().zip([learned.weights()?, moments(learned)?, state]).collect();
     let sha256 = contents.iter().map(|(file, bytes)| ((*file).to_owned(), sha256_hex(bytes))).collect();
     let manifest = serde_json::to_vec_pretty(&Manifest { format: FORMAT, sha256 });
     contents.push((MANIFEST, manifest.map_err(|e| unwritable(MANIFEST, e))?));
@@ -229,7 +227,7 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
     disk.sync(folder).map_err(io(folder))
 }
 
-/// Removes what a kill left of checkpoints that were being written. Nobody else may be writing.
+/// Removes what a kill left of checkpoints that were being written. No other process may be writing.
 pub fn clean(run: &Path) {
     let Ok(entries) = fs::read_dir(run.join("checkpoints")) else { return };
     let unfinished = |path: &Path| {
@@ -294,23 +292,31 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
         }
         contents.push(bytes);
     }
-    let progress: Progress = serde_json::from_slice(&contents[2]).map_err(|e| corrupt("state.json", e.to_string()))?;
-    let mut learned = template.clone();
-    from_safetensors(&contents[0], "actor", &mut learned.executor.actor)?;
-    from_safetensors(&contents[0], "critic", &mut learned.executor.critic)?;
-    from_safetensors(&contents[0], "commander", &mut learned.commander.params)?;
-    let moments = |prefix: &str, layout: &Params, steps: u64| -> Result<Adam, CheckpointError> {
-        let mut numbers = [layout.clone(), layout.clone()];
-        from_safetensors(&contents[1], &format!("{prefix}.first"), &mut numbers[0])?;
-        from_safetensors(&contents[1], &format!("{prefix}.second"), &mut numbers[1])?;
-        let [first, second] = numbers;
-        Ok(Adam { first: first.numbers, second: second.numbers, steps })
+    let state: State = serde_json::from_slice(&contents[2]).map_err(|e| corrupt("state.json", e.to_string()))?;
+    let restore = |network: &Network| {
+        let (name, entries) = (&network.name, &network.params.entries);
+        let load = |bytes: &[u8], name: &str| Params::load(entries.clone(), bytes, name);
+        let steps = state.adam_steps.get(name);
+        let steps = *steps.ok_or_else(|| corrupt("state.json", format!("adam_steps.{name} is missing")))?;
+        let params = load(&contents[0], name)?;
+        let first = load(&contents[1], &format!("{name}.first"))?.values;
+        let second = load(&contents[1], &format!("{name}.second"))?.values;
+        Ok(Network { params, adam: Adam { first, second, steps }, ..network.clone() })
     };
-    learned.executor.actor_adam = moments("actor", &template.executor.actor, progress.adam_steps[0])?;
-    learned.executor.critic_adam = moments("critic", &template.executor.critic, progress.adam_steps[1])?;
-    learned.commander.adam = moments("commander", &template.commander.params, progress.adam_steps[2])?;
-    learned.executor.value_norm = progress.value_norm;
-    Ok((progress, learned))
+    let networks = template.networks.iter().map(restore).collect::<Result<Vec<_>, CheckpointError>>()?;
+    Ok((state.progress, Learned { networks, value_norm: state.value_norm }))
+}
+
+/// Rejects a run folder whose newest checkpoint has another format, before anything else in it is read: its configuration
+/// may have other keys.
+pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
+    let Some(path) = list(run)?.pop() else { return Ok(()) };
+    let manifest = fs::read(path.join(MANIFEST)).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    match manifest {
+        Some(Format { format: FIRST_FORMAT }) => Err(CheckpointError::Format { path, format: FIRST_FORMAT }),
+        // Any other number may be a flipped bit: `read` tells damage from another format.
+        _ => Ok(()),
+    }
 }
 
 /// The newest checkpoint that can be read, and what was wrong with the newer ones. One of another format is not damage: what

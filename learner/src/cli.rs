@@ -1,5 +1,6 @@
 //! The learner's command line.
 
+use crate::checkpoint;
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::page::{LivePage, RunInfo};
 use crate::run_folder::{CONFIG_FILE, RunFolderState};
@@ -214,6 +215,9 @@ async fn serve(handle: LearnerHandle, incoming: server::Incoming, stop: Cancella
 
 /// The configuration in effect: flags over environment over file; when resuming, the run's own file.
 fn configure(args: &LearnerArgs) -> Result<RunConfig, Failure> {
+    if args.resume {
+        checkpoint::check_format(&args.out).map_err(Failure::usage)?;
+    }
     let own = args.out.join(CONFIG_FILE);
     let path = match &args.config {
         Some(path) => Some(path.clone()),

@@ -4,5 +4,6 @@ pub mod adam;
 pub mod batch;
 pub mod commander_ppo;
 pub mod gae;
-pub mod loss;
+pub mod learned;
 pub mod mappo;
+pub mod stats;

@@ -8,7 +8,7 @@ mod saving;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
-use crate::checkpoint::{self, CheckpointError, Learned, Progress, sha256_hex};
+use crate::checkpoint::{self, CheckpointError, Progress, sha256_hex};
 use crate::collector::Collector;
 use crate::page::{Phase, RunEnd};
 use crate::report::means::{EvalSummary, summarise};
@@ -18,7 +18,9 @@ use crate::report::tensorboard::EventFile;
 use crate::run_events::{CollectError, IterationReport, RunEvent};
 use crate::train::batch::Batch;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
-use crate::train::mappo::{Mappo, UpdateStats};
+use crate::train::learned::Learned;
+use crate::train::mappo::Mappo;
+use crate::train::stats::UpdateStats;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, WeightsVersion};
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
@@ -92,7 +94,7 @@ impl Trainer {
     fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mappo = Mappo::new(config)?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-        let learned = Learned { executor: mappo.start()?, commander: commander.start()? };
+        let learned = Learned::init(&mappo, &commander)?;
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads.max(1))
@@ -100,15 +102,12 @@ impl Trainer {
             .stack_size(64 << 20)
             .build()?;
         let progress = Progress {
-            format: checkpoint::FORMAT,
             run_id: run_id.0.clone(),
             config_sha256: config_sha256(config)?,
             iteration: 0,
             joint_env_steps: 0,
             on_target: 0,
             wall_s: 0.0,
-            value_norm: learned.executor.value_norm,
-            adam_steps: [0; 3],
         };
         Ok(Self {
             config: config.clone(),
@@ -279,12 +278,12 @@ impl Trainer {
         let (mappo, learned, seed) = (&self.mappo, &mut self.learned, self.config.run.seed);
         let stats = self.pool.install(|| {
             let batch = Batch::new(seed, mappo.spec(), trajectories);
-            mappo.update(&mut learned.executor, &batch, iteration, done.min(1.0))
+            mappo.update(learned, &batch, iteration, done.min(1.0))
         })?;
         timing.executor_s = clock.elapsed().as_secs_f64();
         let clock = Instant::now();
         let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
-        let commander = self.commander.update(&mut self.learned.commander, trajectories, iteration, rate)?;
+        let commander = self.commander.update(&mut self.learned, trajectories, iteration, rate)?;
         timing.commander_s = clock.elapsed().as_secs_f64();
         Ok((stats, commander))
     }

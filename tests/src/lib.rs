@@ -46,8 +46,6 @@ pub struct Ran {
     pub outcome: TrainOutcome,
     /// Hash of actor, critic and commander.
     pub sha256: String,
-    /// Hash of the goal commander alone.
-    pub commander_sha256: String,
     /// Events in order.
     pub events: Vec<RunEvent>,
 }
@@ -66,10 +64,9 @@ pub fn drive(mut trainer: Trainer, config: &RunConfig, actors: usize, stop: &Arc
     let outcome = trainer.run(&mut collector).expect("training");
     let learned = trainer.learned();
     let sha256 = magex_learner::checkpoint::sha256_hex(&learned.weights().expect("weights"));
-    let commander_sha256 = learned.commander.params.sha256();
     // The channel ends with its sender.
     drop(trainer);
-    Ran { outcome, sha256, commander_sha256, events: receiver.iter().collect() }
+    Ran { outcome, sha256, events: receiver.iter().collect() }
 }
 
 /// The `executor` part of every metrics line.

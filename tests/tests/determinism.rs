@@ -47,10 +47,9 @@ fn every_task_gives_the_same_bits_and_ratios_of_one() {
         let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
         assert_eq!(ran.sha256, hash(&config, 3, 2), "{name} {kind}: three rollout and two training threads");
         for line in updates(&ran.events).iter().filter(|l| !l["executor"].is_null()) {
-            for part in ["executor", "commander"] {
-                let error = line[part]["first_ratio_error"].as_f64().unwrap();
-                assert!(error <= 1e-6, "{name} {kind}: iteration {}, {part}: {error}", line["iteration"]);
-            }
+            let error = |part: &str| line[part]["first_ratio_error"].as_f64().unwrap();
+            assert_eq!(error("executor"), 0.0, "{name} {kind}: iteration {}", line["iteration"]);
+            assert!(error("commander") <= 1e-6, "{name} {kind}: iteration {}", line["iteration"]);
             assert_eq!(line["second_cost_ratio"].is_null(), line["success_rate"].is_null() || name == TaskName::Drones);
         }
     }
@@ -140,7 +139,9 @@ fn the_first_importance_ratio_is_one() {
         let ran = train(&small(kind, 6, 3), tempfile::tempdir().unwrap().path(), 2, 1);
         for line in updates(&ran.events).iter().filter(|l| !l["executor"].is_null()) {
             let error = line["executor"]["first_ratio_error"].as_f64().unwrap();
-            assert!(error <= 1e-6, "{kind}: iteration {} has ratio error {error}", line["iteration"]);
+            // The attention ablation uses the tensor library's products, which give a row other bits in a batch.
+            let limit = if kind == ExecutorKind::Attention { 1e-6 } else { 0.0 };
+            assert!(error <= limit, "{kind}: iteration {} has ratio error {error}", line["iteration"]);
             let error = line["commander"]["first_ratio_error"].as_f64().unwrap();
             assert!(error <= 1e-6, "{kind}: the commander's log-probabilities differ by {error}");
         }
@@ -153,20 +154,18 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
         let mut config = small(ExecutorKind::Local, 5, 2);
         config.commander.kind = kind;
         let folder = tempfile::tempdir().unwrap();
-        let before = Trainer::create(&config, magex_core::ids::RunId("r".into()), folder.path(), 1)
-            .unwrap()
-            .learned()
-            .commander
-            .clone();
-        let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
+        let trainer = Trainer::create(&config, RunId("r".into()), folder.path(), 1).unwrap();
+        let before = trainer.learned().clone();
+        let ran = drive(trainer, &config, 1, &Arc::new(AtomicBool::new(false)));
+        let after = checkpoint::read_latest(folder.path(), &before).unwrap().1;
         let TrainOutcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
         let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
         assert!(ratio >= 0.999, "{kind}: better than exact");
         if kind == CommanderKind::Exact {
             assert!((ratio - 1.0).abs() < 1e-6);
         }
-        assert_eq!(before.params.numbers.is_empty(), !kind.learned(), "{kind}");
-        assert_eq!(before.params.sha256() != ran.commander_sha256, kind.learned(), "{kind}: what training changed");
+        let changed = before.network("commander").unwrap().params != after.network("commander").unwrap().params;
+        assert_eq!(changed, kind.learned(), "{kind}");
     }
 }
 

@@ -326,11 +326,12 @@ fn a_checkpoint_of_another_format_is_refused_with_the_remedy() {
     let newest = checkpoint::list(folder.path()).unwrap().pop().unwrap();
     for file in ["manifest.json", "state.json"] {
         let text = std::fs::read_to_string(newest.join(file)).unwrap();
-        std::fs::write(newest.join(file), text.replace("\"format\": 1", "\"format\": 0")).unwrap();
+        std::fs::write(newest.join(file), text.replace("\"format\": 2", "\"format\": 0")).unwrap();
     }
     let error = Trainer::resume(&config, folder.path(), 1).unwrap_err().to_string();
     assert!(
-        error.contains("its format is 0, this release reads format 1; resume with the release that wrote it"),
+        error.contains("format 0, written by another release of magex")
+            && error.contains("resume with the release that"),
         "{error}"
     );
     let template = Trainer::create(&config, RunId("r".into()), tempfile::tempdir().unwrap().path(), 1).unwrap();

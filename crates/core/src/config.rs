@@ -111,6 +111,13 @@ impl std::fmt::Display for ExecutorKind {
     }
 }
 
+impl ExecutorKind {
+    /// Whether the weights serve one team size only.
+    pub fn fixed_team_size(self) -> bool {
+        self == Self::Mlp
+    }
+}
+
 /// `[executor]`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -131,6 +138,13 @@ pub struct ExecutorConfig {
     pub hidden: usize,
     /// Neighbours of `local`.
     pub neighbours: usize,
+}
+
+impl ExecutorConfig {
+    /// H: width of the memory, 0 for executors without one.
+    pub fn memory(&self) -> usize {
+        if self.kind == ExecutorKind::Local { 0 } else { self.feature_size }
+    }
 }
 
 impl Default for ExecutorConfig {
@@ -166,6 +180,11 @@ impl CommanderKind {
     /// Whether the commander has weights that PPO trains.
     pub fn learned(self) -> bool {
         matches!(self, Self::Pairwise | Self::Ranking)
+    }
+
+    /// Whether the weights serve one team size only.
+    pub fn fixed_team_size(self) -> bool {
+        self == Self::Ranking
     }
 }
 
@@ -419,7 +438,7 @@ impl RunConfig {
         within("mappo.epochs", m.epochs.into(), 1.0, 1000.0)?;
         within("mappo.minibatch_size", m.minibatch_size as f64, 1.0, 1e8)?;
         within("mappo.chunk_length", m.chunk_length as f64, 1.0, self.task.horizon.into())?;
-        if e.kind != ExecutorKind::Local && !(self.task.horizon as usize).is_multiple_of(m.chunk_length) {
+        if e.memory() > 0 && !(self.task.horizon as usize).is_multiple_of(m.chunk_length) {
             return Err(range(format!(
                 "mappo.chunk_length: {} must divide task.horizon = {}, or chunks would cross episodes",
                 m.chunk_length, self.task.horizon

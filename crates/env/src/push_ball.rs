@@ -14,17 +14,17 @@ use magex_core::metrics_table::{
     SPAWN_SUCCESS_RATE, SUCCESS_RATE,
 };
 use magex_core::rng::Stream;
-use magex_core::task::TaskConfig;
+use magex_core::task::{PushBallConfig, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 
 pub use start::{Start, spawn};
 
 /// Radius of an agent.
-pub const AGENT_RADIUS: f64 = 0.1;
+pub const AGENT_RADIUS: f64 = PushBallConfig::AGENT_RADIUS;
 /// Radius of a ball.
-pub const BALL_RADIUS: f64 = 0.15;
+pub const BALL_RADIUS: f64 = PushBallConfig::BALL_RADIUS;
 /// An agent touches a ball when their centres are this close.
-pub const PUSH_DISTANCE: f64 = AGENT_RADIUS + BALL_RADIUS;
+pub const PUSH_DISTANCE: f64 = PushBallConfig::PUSH_DISTANCE;
 /// A landmark is covered when a ball's centre is within this distance (ball radius 0.15 + landmark radius 0.15).
 pub const REACHED: f64 = 0.3;
 

@@ -5,7 +5,7 @@ use crate::folder::Trained;
 use crate::local::{Crew, commander};
 use crate::settings::resize;
 use magex_actor::rollout::Roller;
-use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderKind, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
@@ -85,13 +85,16 @@ impl Variation {
         let mut config = trained.config.clone();
         if let Some(agents) = self.agents.filter(|&agents| agents != config.task.agents) {
             let own = config.task.agents;
-            let fixed = match (config.executor.kind, self.scheduler.unwrap_or(config.commander.kind)) {
-                (ExecutorKind::Mlp, _) if self.controller == Controller::Learned => Some(("the mlp executor", "")),
-                (_, CommanderKind::Ranking) => Some(("the ranking scheduler", "; use --scheduler exact")),
-                _ => None,
+            let (executor, scheduler) = (config.executor.kind, self.scheduler_of(&config));
+            let fixed = if executor.fixed_team_size() && self.controller == Controller::Learned {
+                Some((format!("the {executor} executor"), ""))
+            } else if scheduler.fixed_team_size() {
+                Some((format!("the {scheduler} scheduler"), "; use --scheduler exact"))
+            } else {
+                None
             };
-            if let Some((who, remedy)) = fixed {
-                return Err(usage(format!("--agents {agents}: {who} of this run was built for {own} agents{remedy}")));
+            if let Some((part, remedy)) = fixed {
+                return Err(usage(format!("--agents {agents}: {part} of this run was built for {own} agents{remedy}")));
             }
             resize(&mut config.task, agents);
         }

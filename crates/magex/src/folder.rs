@@ -12,8 +12,9 @@
 use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
-use magex_learner::checkpoint::{self, CheckpointError, Learned, sha256_hex};
+use magex_learner::checkpoint::{self, CheckpointError, sha256_hex};
 use magex_learner::train::commander_ppo::CommanderPpo;
+use magex_learner::train::learned::Learned;
 use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
@@ -61,6 +62,7 @@ pub(crate) fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
         }
         _ => usage(format!("{}: {error}", path.display())),
     })?;
+    checkpoint::check_format(folder).map_err(usage)?;
     RunConfig::from_toml(&text).with_context(|| path.display().to_string())
 }
 
@@ -117,10 +119,8 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
         (Err(_), Some(_)) => notes.push(format!("{WEIGHTS} is missing")),
         (_, None) => notes.push("the run is not finished".to_owned()),
     }
-    let template = Learned {
-        executor: Mappo::new(config)?.start()?,
-        commander: CommanderPpo::new(&config.commander, &config.task, config.run.seed).start()?,
-    };
+    let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
+    let template = Learned::init(&Mappo::new(config)?, &commander)?;
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));
     notes.push(format!("using checkpoint {:06}", progress.iteration));

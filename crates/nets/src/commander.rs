@@ -1,8 +1,8 @@
-//! The goal commander (paper, section 4.1): who goes where, decided once per episode.
+//! The goal commander (paper, section 4.1) assigns goals to agents, once per episode.
 //!
 //! | kind | decision |
 //! |---|---|
-//! | `pairwise` | a score for every (agent, goal) pair; whoever has most to lose picks next among the goals still free. Equivariant, any N |
+//! | `pairwise` | a score for every (agent, goal) pair; the agent of the largest regret picks next among the goals still free. Equivariant, any N |
 //! | `ranking` | the paper's Goal Scheduler: one score per goal, ranked, handed to the agents in canonical order |
 //! | `exact` | the least summed distance (Jonker–Volgenant; the paper's "Hungarian") |
 //! | `random` | a random permutation (the paper's ablation "w. RG") |
@@ -12,8 +12,8 @@ mod pairwise;
 mod ranking;
 
 use crate::ops::{Pick, PickTable, pick_log_probs};
-use crate::params::{ParamError, Params, Source, from_safetensors};
-use candle_core::{Device, Tensor};
+use crate::params::{Entry, ParamBuilder, ParamError, Params};
+use candle_core::Tensor;
 use magex_assign::random::random;
 use magex_assign::{AssignError, exact_points};
 use magex_core::config::{CommanderConfig, CommanderKind};
@@ -37,7 +37,7 @@ pub enum CommanderError {
     /// The weights do not fit, or the tensor library refused.
     #[error(transparent)]
     Weights(#[from] ParamError),
-    /// Nobody waits for the answer any more.
+    /// The caller no longer waits for the answer.
     #[error("interrupted")]
     Interrupted,
 }
@@ -104,33 +104,40 @@ impl Commander {
         config: &CommanderConfig,
         agents: usize,
         dims: usize,
-        source: &mut Source<'_>,
+        params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let net = match config.kind {
-            CommanderKind::Pairwise => Some(Net::Pairwise(PairwiseNet::build(config.hidden, source)?)),
+            CommanderKind::Pairwise => Some(Net::Pairwise(PairwiseNet::build(config.hidden, params)?)),
             CommanderKind::Ranking => {
-                Some(Net::Ranking(RankingNet::build(config.hidden, agents, dims, config.order, source)?))
+                Some(Net::Ranking(RankingNet::build(config.hidden, agents, dims, config.order, params)?))
             }
             CommanderKind::Exact | CommanderKind::Random => None,
         };
         Ok(Self { kind: config.kind, net })
     }
 
-    /// Fresh parameters (empty for schedulers that are not learned).
-    pub fn start(config: &CommanderConfig, agents: usize, dims: usize, seed: u64) -> Result<Params, ParamError> {
-        let mut source = Source::new(Key::new(seed, Purpose::Init, &[2]).stream());
-        Self::build(config, agents, dims, &mut source)?;
-        match source {
-            Source::New { params, .. } => Ok(params),
-            Source::Existing { .. } => Err(ParamError::Mismatch("a new source became an existing one".to_owned())),
-        }
+    /// Names, shapes and initial distributions of the parameters; none for schedulers that are not learned.
+    fn layout(config: &CommanderConfig, agents: usize, dims: usize) -> Result<Vec<Entry>, ParamError> {
+        let mut params = ParamBuilder::layout();
+        Self::build(config, agents, dims, &mut params)?;
+        Ok(params.entries())
+    }
+
+    /// Initial parameters.
+    pub fn init(config: &CommanderConfig, agents: usize, dims: usize, seed: u64) -> Result<Params, ParamError> {
+        let stream = Key::new(seed, Purpose::Init, &[2]).stream();
+        Ok(Params::init(Self::layout(config, agents, dims)?, stream))
+    }
+
+    /// With given parameters, as constants.
+    pub fn of(config: &CommanderConfig, agents: usize, dims: usize, params: &Params) -> Result<Self, ParamError> {
+        Self::build(config, agents, dims, &mut ParamBuilder::with(params.tensors()?))
     }
 
     /// From the `commander.…` tensors of a safetensors file.
     pub fn load(config: &CommanderConfig, agents: usize, dims: usize, weights: &[u8]) -> Result<Self, ParamError> {
-        let mut params = Self::start(config, agents, dims, 0)?;
-        from_safetensors(weights, "commander", &mut params)?;
-        Self::build(config, agents, dims, &mut params.source(params.plain()?))
+        let params = Params::load(Self::layout(config, agents, dims)?, weights, "commander")?;
+        Self::of(config, agents, dims, &params)
     }
 
     /// A scheduler without weights.
@@ -187,10 +194,4 @@ impl Commander {
         }
         Ok(pick_log_probs(&self.scores(instances)?, Arc::new(tables))?)
     }
-}
-
-/// A constant tensor [rows, width].
-fn constant(numbers: Vec<f32>, width: usize) -> candle_core::Result<Tensor> {
-    let rows = numbers.len() / width;
-    Tensor::from_vec(numbers, (rows, width), &Device::Cpu)
 }

@@ -1,7 +1,7 @@
 //! Categorical action distributions, evaluated row by row. Actors (to act) and learner (to differentiate) share this
 //! code, so equal logits give equal log-probabilities to the bit.
 
-use crate::simd::{LANES, load};
+use crate::ops::{LANES, load};
 use magex_core::rng::Stream;
 use wide::f32x16;
 

@@ -1,4 +1,5 @@
-//! The action executor (paper, section 4.2): actor and critic networks behind one small trait.
+//! The action executor (paper, section 4.2). A [`Model`] says which networks a run has and builds its [`Policy`] and value
+//! function on them; rollouts call [`Policy::act`], the update calls [`Policy::evaluate`].
 //!
 //! | kind | team features E_a | goal features | memory |
 //! |---|---|---|---|
@@ -11,17 +12,21 @@
 //! Where a task has encounters, `magex`, `attention` and `mlp` sum over the k nearest neighbours, too (Encounter Encoder).
 
 mod local;
+mod model;
+mod policy;
 mod team;
 
 use crate::features::{FeatureSpec, Features};
-use crate::matmul::Activation;
-use crate::ops::{GraphNoise, linear};
-use crate::params::{ParamError, Source, Start};
-use candle_core::{Device, Result as CandleResult, Tensor};
+use crate::ops::{Activation, GraphNoise, linear};
+use crate::params::{Init, ParamBuilder, ParamError};
+use candle_core::{Result as CandleResult, Tensor};
+use candle_nn::Module;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
 
 pub use local::LocalNet;
+pub use model::{Model, Part};
+pub use policy::{Acted, Chooser, Evaluated, Independent, Policy};
 pub use team::TeamNet;
 
 /// What a network sees: L steps of C sequences of N agents, rows ordered [L, C, N].
@@ -41,7 +46,7 @@ pub struct Input<'a> {
     pub noise: GraphNoise,
 }
 
-/// What a network answers.
+/// What a network returns.
 #[derive(Debug)]
 pub struct Output {
     /// [L·C·N, O] action logits or values.
@@ -50,13 +55,10 @@ pub struct Output {
     pub states: Option<Tensor>,
 }
 
-/// An executor network: actor (O = number of action logits) or critic (O = 1).
+/// A network with O outputs per agent: the logits of a policy whose agents act independently, or a value function (O = 1).
 pub trait Network: Send + Sync {
     /// One pass over a batch of sequences.
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output>;
-
-    /// H: width of the memory, 0 for none.
-    fn memory(&self) -> usize;
 }
 
 /// What features the executor of a run wants. The graph executors see single neighbours where the task has encounters.
@@ -67,11 +69,6 @@ pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
     FeatureSpec::new(task, !literal, neighbours, !local)
 }
 
-/// H of the executor's memory, without building it.
-pub fn memory(config: &ExecutorConfig) -> usize {
-    if config.kind == ExecutorKind::Local { 0 } else { config.feature_size }
-}
-
 /// Builds an actor or critic with `outputs` outputs; `head_gain` is the orthogonal gain of the last layer
 /// (0.01 for actors, 1 for critics). `agents` matters to `mlp` only.
 pub fn build(
@@ -80,11 +77,11 @@ pub fn build(
     agents: usize,
     outputs: usize,
     head_gain: f64,
-    source: &mut Source<'_>,
+    params: &mut ParamBuilder,
 ) -> Result<Box<dyn Network>, ParamError> {
     Ok(match config.kind {
-        ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, source)?),
-        _ => Box::new(TeamNet::build(config, spec, agents, outputs, head_gain, source)?),
+        ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, params)?),
+        _ => Box::new(TeamNet::build(config, spec, agents, outputs, head_gain, params)?),
     })
 }
 
@@ -93,37 +90,36 @@ pub(crate) struct Layer {
     w: Tensor,
     b: Tensor,
     act: Activation,
+    constant_input: bool,
 }
 
 impl Layer {
     pub(crate) fn build(
-        source: &mut Source<'_>,
+        params: &mut ParamBuilder,
         name: &str,
         (inputs, outputs): (usize, usize),
         act: Activation,
         gain: f64,
     ) -> Result<Self, ParamError> {
         Ok(Self {
-            w: source.get(&format!("{name}.weight"), &[inputs, outputs], Start::Orthogonal(gain))?,
-            b: source.get(&format!("{name}.bias"), &[outputs], Start::Constant(0.0))?,
+            w: params.tensor(&format!("{name}.weight"), &[inputs, outputs], Init::Orthogonal(gain))?,
+            b: params.tensor(&format!("{name}.bias"), &[outputs], Init::Constant(0.0))?,
             act,
+            constant_input: false,
         })
     }
 
-    pub(crate) fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
-        linear(x, &self.w, &self.b, self.act, false)
+    /// The same layer for inputs that need no gradient (features).
+    pub(crate) fn on_features(self) -> Self {
+        Self { constant_input: true, ..self }
     }
+}
 
-    /// For inputs that need no gradient (features).
-    pub(crate) fn forward_constant(&self, x: &Tensor) -> CandleResult<Tensor> {
-        linear(x, &self.w, &self.b, self.act, true)
+impl Module for Layer {
+    fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
+        linear(x, &self.w, &self.b, self.act, self.constant_input)
     }
 }
 
 /// Gain of layers followed by ReLU.
 pub(crate) const RELU_GAIN: f64 = std::f64::consts::SQRT_2;
-
-/// A constant tensor [rows, width] from features.
-pub(crate) fn constant(numbers: &[f32], width: usize) -> CandleResult<Tensor> {
-    Tensor::from_slice(numbers, (numbers.len() / width, width), &Device::Cpu)
-}

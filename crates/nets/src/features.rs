@@ -3,10 +3,12 @@
 //! Everything is free of translation where it can be, and its scale does not depend on the team size, so that weights
 //! trained with 50 agents serve 20 or 1000. Rows are ordered [.., N]: the N agents of a joint state are neighbours.
 //!
-//! What a task is, [`Observation`] says in numbers; no formula here knows a task by name.
+//! [`Observation`] says in numbers what an agent sees of a task. One task has formulas of its own: those of Push Ball are in
+//! `push`, for tasks in which an agent's way leads to a ball and with it to a landmark.
 
 mod goal;
 mod neighbours;
+mod push;
 mod symmetry;
 
 use magex_core::task::{Frame, Observation, TaskConfig};
@@ -104,7 +106,7 @@ impl FeatureSpec {
             + match (self.relative_goal, self.pushes()) {
                 (false, _) => (2 + self.goals_per_agent) * self.dims,
                 (true, false) => self.dims + self.goals_per_agent * (2 * self.dims + 1),
-                (true, true) => goal::push_width(self.dims),
+                (true, true) => push::width(self.dims),
             }
     }
 
@@ -112,11 +114,6 @@ impl FeatureSpec {
     pub fn neighbour_width(&self) -> usize {
         let approach = if self.observation.encounters { self.dims + 2 } else { 0 };
         2 * self.dims + 1 + approach + usize::from(self.balls > 0)
-    }
-
-    /// Whether an agent's way leads to a ball and with it to a landmark.
-    fn pushes(&self) -> bool {
-        self.balls > 0 && self.goals_per_agent == 2
     }
 
     /// E.
@@ -186,22 +183,10 @@ impl FeatureSpec {
             out.nodes.extend(v.iter().map(|x| x * v_scale));
             out.nodes.extend_from_slice(state.extra(i));
             if self.pushes() {
-                let (offset, distance) = offset(p, state.target(i, 0));
-                out.nodes.extend(offset[..self.dims].iter().map(|x| x / (1.0 + distance)));
+                self.ball_offset(state, i, &mut out.nodes);
             }
             out.pairs.extend(p);
             out.pairs.extend(v.iter().map(|x| x * v_scale));
-        }
-    }
-
-    /// The frame that agent i sees the world in.
-    fn symmetry(&self, state: &State<'_>, i: usize) -> Symmetry {
-        match self.observation.frame {
-            Frame::World => Symmetry::default(),
-            Frame::Push => {
-                let (ball, landmark) = (state.target(i, 0), state.target(i, self.goals_per_agent - 1));
-                Symmetry::facing(offset(ball, landmark).0, offset(state.position(i), ball).0)
-            }
         }
     }
 }

@@ -1,5 +1,13 @@
-//! Networks of MAGE-X on candle: features, layers with hand-written gradients, the action executor and its ablations,
-//! the goal commander, and parameter I/O. No tokio, no clock, no thread.
+//! Networks of MAGE-X on candle, and what they see. No tokio, no clock, no thread.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`features`] | from states to the numbers that networks see |
+//! | [`executor`] | the action executor and its ablations: [`executor::Model`], [`executor::Policy`] |
+//! | [`commander`] | the goal commander |
+//! | [`distribution`] | categorical actions |
+//! | [`ops`] | layers as custom operations with hand-written gradients |
+//! | [`params`] | parameters: initialisation, order, weights files |
 
 #![allow(
     clippy::needless_range_loop,
@@ -10,9 +18,5 @@ pub mod commander;
 pub mod distribution;
 pub mod executor;
 pub mod features;
-mod matmul;
 pub mod ops;
 pub mod params;
-mod simd;
-
-pub use matmul::Activation;

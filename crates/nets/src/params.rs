@@ -1,9 +1,9 @@
-//! Parameters: one flat, ordered vector of numbers with names and shapes. The order is the order of construction, so a
-//! norm or a hash over it is always summed the same way (candle's own `VarMap` is a hash map).
+//! Parameters: one flat, ordered vector of values with names and shapes. The order is the order of construction, so a
+//! norm or a hash over it is always summed the same way. candle's `VarMap` is a hash map and draws from a global generator.
 
-use candle_core::{Device, Result as CandleResult, Tensor, Var};
+use candle_core::backprop::GradStore;
+use candle_core::{DType, Device, Result as CandleResult, Tensor, Var};
 use magex_core::rng::Stream;
-use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 
 /// Why parameters could not be built, written or read.
@@ -20,33 +20,35 @@ pub enum ParamError {
     Tensor(#[from] candle_core::Error),
 }
 
-/// How a tensor starts.
+/// Initial distribution of a tensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Start {
+pub enum Init {
     /// Orthogonal rows or columns times a gain.
     Orthogonal(f64),
-    /// One number.
+    /// One value.
     Constant(f32),
 }
 
 /// Name, shape and place of one tensor.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// Dotted name, unique within the network.
     pub name: String,
     /// Dimensions.
     pub shape: Vec<usize>,
-    /// First index in [`Params::numbers`].
+    /// How it is initialised.
+    pub init: Init,
+    /// First index in [`Params::values`].
     pub start: usize,
 }
 
 impl Entry {
-    /// Count of numbers.
+    /// Count of values.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
 
-    /// Whether the tensor has no numbers.
+    /// Whether the tensor has no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -57,99 +59,118 @@ impl Entry {
 pub struct Params {
     /// Tensors in order of construction.
     pub entries: Vec<Entry>,
-    /// Their numbers, one tensor after the other.
-    pub numbers: Vec<f32>,
+    /// Their values, one tensor after the other.
+    pub values: Vec<f32>,
 }
 
-/// Where a network takes its tensors from while it is being built.
-pub enum Source<'a> {
-    /// Draws new parameters and remembers them.
-    New {
-        /// Keyed stream of the initial weights.
-        stream: Box<Stream>,
-        /// What has been drawn.
-        params: Params,
-    },
-    /// Takes existing tensors in the same order.
-    Existing {
-        /// Names and shapes to check against.
-        params: &'a Params,
-        /// One tensor per entry.
-        tensors: Vec<Tensor>,
-        /// Entries taken.
-        taken: usize,
-    },
+/// Hands a network its tensors while it is being built, and records their names, shapes and initial distributions.
+#[derive(Debug, Default)]
+pub struct ParamBuilder {
+    entries: Vec<Entry>,
+    count: usize,
+    given: Option<Vec<Tensor>>,
 }
 
-impl Source<'_> {
-    /// A source that draws.
-    pub fn new(stream: Stream) -> Self {
-        Self::New { stream: Box::new(stream), params: Params::default() }
+impl ParamBuilder {
+    /// Hands out zeros: what is built shows the layout, without drawing or reading a value.
+    pub fn layout() -> Self {
+        Self::default()
     }
 
-    /// The next tensor: drawn, or taken and checked against name and shape.
-    pub fn get(&mut self, name: &str, shape: &[usize], start: Start) -> Result<Tensor, ParamError> {
-        match self {
-            Self::New { stream, params } => {
-                let values = match start {
-                    Start::Constant(value) => vec![value; shape.iter().product()],
-                    Start::Orthogonal(gain) => orthogonal(shape, gain, stream),
-                };
-                let entry = Entry { name: name.to_owned(), shape: shape.to_vec(), start: params.numbers.len() };
-                params.numbers.extend_from_slice(&values);
-                params.entries.push(entry);
-                Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
-            }
-            Self::Existing { params, tensors, taken } => {
-                let entry = params.entries.get(*taken);
-                match (entry, tensors.get(*taken)) {
-                    (Some(entry), Some(tensor)) if entry.name == name && entry.shape == shape => {
-                        *taken += 1;
-                        Ok(tensor.clone())
-                    }
-                    (Some(entry), _) => Err(ParamError::Mismatch(format!(
-                        "the network wants {name} {shape:?} where the file has {} {:?}; was it trained with another [executor] or [commander]?",
-                        entry.name, entry.shape
-                    ))),
-                    (None, _) => Err(ParamError::Mismatch(format!("{name} {shape:?} is missing"))),
+    /// Hands out the given tensors in the order of construction.
+    pub fn with(tensors: Vec<Tensor>) -> Self {
+        Self { given: Some(tensors), ..Self::default() }
+    }
+
+    /// The next tensor.
+    pub fn tensor(&mut self, name: &str, shape: &[usize], init: Init) -> Result<Tensor, ParamError> {
+        let tensor = match &self.given {
+            None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
+            Some(given) => match given.get(self.entries.len()) {
+                Some(tensor) if tensor.dims() == shape => tensor.clone(),
+                other => {
+                    let found = other.map(Tensor::dims);
+                    return Err(ParamError::Mismatch(format!(
+                        "the network wants {name} {shape:?}, there is {found:?}"
+                    )));
                 }
-            }
-        }
+            },
+        };
+        let entry = Entry { name: name.to_owned(), shape: shape.to_vec(), init, start: self.count };
+        self.count += entry.len();
+        self.entries.push(entry);
+        Ok(tensor)
+    }
+
+    /// What was asked for, in order.
+    pub fn entries(self) -> Vec<Entry> {
+        self.entries
     }
 }
 
 impl Params {
-    /// Plain tensors: a forward pass on them records no graph.
-    pub fn plain(&self) -> CandleResult<Vec<Tensor>> {
+    /// Initial values, drawn in the order of the entries.
+    pub fn init(entries: Vec<Entry>, mut stream: Stream) -> Self {
+        let mut values = Vec::new();
+        for entry in &entries {
+            match entry.init {
+                Init::Constant(value) => values.resize(values.len() + entry.len(), value),
+                Init::Orthogonal(gain) => values.extend(orthogonal(&entry.shape, gain, &mut stream)),
+            }
+        }
+        Self { entries, values }
+    }
+
+    /// The values of one network of a safetensors file written by [`to_safetensors`].
+    pub fn load(entries: Vec<Entry>, bytes: &[u8], network: &str) -> Result<Self, ParamError> {
+        let file = safetensors::SafeTensors::deserialize(bytes)?;
+        let mut values = Vec::new();
+        for entry in &entries {
+            let name = format!("{network}.{}", entry.name);
+            let view = file.tensor(&name).map_err(|_| ParamError::Mismatch(format!("{name} is missing")))?;
+            if view.dtype() != safetensors::Dtype::F32 || view.shape() != entry.shape {
+                return Err(ParamError::Mismatch(format!(
+                    "{name} is {:?} {:?}, expected F32 {:?}; was it trained with another configuration or team size?",
+                    view.dtype(),
+                    view.shape(),
+                    entry.shape
+                )));
+            }
+            for chunk in view.data().chunks_exact(4) {
+                let value = f32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]);
+                if !value.is_finite() {
+                    return Err(ParamError::Mismatch(format!("{name} contains {value}")));
+                }
+                values.push(value);
+            }
+        }
+        Ok(Self { entries, values })
+    }
+
+    /// Constant tensors: a forward pass on them records no graph.
+    pub fn tensors(&self) -> CandleResult<Vec<Tensor>> {
         self.entries
             .iter()
-            .map(|e| Tensor::from_slice(&self.numbers[e.start..e.start + e.len()], e.shape.as_slice(), &Device::Cpu))
+            .map(|e| Tensor::from_slice(&self.values[e.start..e.start + e.len()], e.shape.as_slice(), &Device::Cpu))
             .collect()
     }
 
-    /// Variables: a forward pass on them can be differentiated. They own a copy of the numbers.
+    /// Variables: a forward pass on them can be differentiated. They own a copy of the values, which is cheap at the size of
+    /// these networks and lets several threads differentiate at once.
     pub fn variables(&self) -> CandleResult<Vec<Var>> {
-        self.plain()?.iter().map(Var::from_tensor).collect()
+        self.tensors()?.iter().map(Var::from_tensor).collect()
     }
 
-    /// A source that hands out the given tensors under this layout.
-    pub fn source(&self, tensors: Vec<Tensor>) -> Source<'_> {
-        Source::Existing { params: self, tensors, taken: 0 }
-    }
-
-    /// SHA-256 over names, shapes and bits, in order.
-    pub fn sha256(&self) -> String {
-        let mut hash = Sha256::new();
-        for entry in &self.entries {
-            hash.update(entry.name.as_bytes());
-            for dim in &entry.shape {
-                hash.update((*dim as u64).to_le_bytes());
+    /// The gradient as flat as the values; zero where a variable does not reach the loss, empty without variables.
+    pub fn gradient(&self, variables: &[Var], gradients: &GradStore) -> CandleResult<Vec<f32>> {
+        let mut flat = Vec::with_capacity(if variables.is_empty() { 0 } else { self.values.len() });
+        for variable in variables {
+            match gradients.get(variable) {
+                Some(gradient) => flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?),
+                None => flat.resize(flat.len() + variable.elem_count(), 0.0),
             }
         }
-        for number in &self.numbers {
-            hash.update(number.to_le_bytes());
-        }
-        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        Ok(flat)
     }
 }
 
@@ -159,8 +180,8 @@ pub fn to_safetensors(networks: &[(&str, &Params)], note: &str) -> Result<Vec<u8
     let mut tensors = Vec::new();
     for (prefix, params) in networks {
         for entry in &params.entries {
-            let numbers = &params.numbers[entry.start..entry.start + entry.len()];
-            let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+            let values = &params.values[entry.start..entry.start + entry.len()];
+            let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
             tensors.push((format!("{prefix}.{}", entry.name), entry.shape.clone(), bytes));
         }
     }
@@ -172,43 +193,6 @@ pub fn to_safetensors(networks: &[(&str, &Params)], note: &str) -> Result<Vec<u8
         .collect();
     // safetensors keeps metadata in a hash map; one entry has only one order.
     Ok(safetensors::serialize(views?, Some(HashMap::from([("magex".to_owned(), note.to_owned())])))?)
-}
-
-/// The note of a safetensors file written by [`to_safetensors`].
-pub fn note(bytes: &[u8]) -> Result<String, ParamError> {
-    let (_, header) = safetensors::SafeTensors::read_metadata(bytes)?;
-    header
-        .metadata()
-        .as_ref()
-        .and_then(|m| m.get("magex").cloned())
-        .ok_or_else(|| ParamError::Mismatch("the file has no `magex` metadata".to_owned()))
-}
-
-/// Fills `params` (its layout is kept) with the numbers of one network of a safetensors file.
-pub fn from_safetensors(bytes: &[u8], prefix: &str, params: &mut Params) -> Result<(), ParamError> {
-    let file = safetensors::SafeTensors::deserialize(bytes)?;
-    let mut numbers = Vec::with_capacity(params.numbers.len());
-    for entry in &params.entries {
-        let name = format!("{prefix}.{}", entry.name);
-        let view = file.tensor(&name).map_err(|_| ParamError::Mismatch(format!("{name} is missing")))?;
-        if view.dtype() != safetensors::Dtype::F32 || view.shape() != entry.shape {
-            return Err(ParamError::Mismatch(format!(
-                "{name} is {:?} {:?}, expected F32 {:?}; was it trained with another configuration or team size?",
-                view.dtype(),
-                view.shape(),
-                entry.shape
-            )));
-        }
-        for chunk in view.data().chunks_exact(4) {
-            let number = f32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]);
-            if !number.is_finite() {
-                return Err(ParamError::Mismatch(format!("{name} contains {number}")));
-            }
-            numbers.push(number);
-        }
-    }
-    params.numbers = numbers;
-    Ok(())
 }
 
 /// Orthogonal matrix [rows, columns] times a gain: Gram–Schmidt on Gaussian vectors, in double precision.
@@ -246,14 +230,15 @@ mod tests {
     use super::*;
     use magex_core::rng::{Key, Purpose};
 
+    fn layout() -> Vec<Entry> {
+        let mut builder = ParamBuilder::layout();
+        builder.tensor("a", &[4, 8], Init::Orthogonal(2.0)).unwrap();
+        builder.tensor("b", &[8], Init::Constant(0.5)).unwrap();
+        builder.entries()
+    }
+
     fn drawn() -> Params {
-        let mut source = Source::new(Key::new(1, Purpose::Init, &[0]).stream());
-        source.get("a", &[4, 8], Start::Orthogonal(2.0)).unwrap();
-        source.get("b", &[8], Start::Constant(0.5)).unwrap();
-        match source {
-            Source::New { params, .. } => params,
-            Source::Existing { .. } => unreachable!(),
-        }
+        Params::init(layout(), Key::new(1, Purpose::Init, &[0]).stream())
     }
 
     #[test]
@@ -261,10 +246,11 @@ mod tests {
         let params = drawn();
         for i in 0..4 {
             for j in 0..4 {
-                let dot: f32 = (0..8).map(|k| params.numbers[i * 8 + k] * params.numbers[j * 8 + k]).sum();
+                let dot: f32 = (0..8).map(|k| params.values[i * 8 + k] * params.values[j * 8 + k]).sum();
                 assert!((dot - if i == j { 4.0 } else { 0.0 }).abs() < 1e-5);
             }
         }
+        assert_eq!(params.values[32..], [0.5; 8]);
     }
 
     #[test]
@@ -272,21 +258,18 @@ mod tests {
         let params = drawn();
         let bytes = to_safetensors(&[("actor", &params)], "{}").unwrap();
         assert_eq!(bytes, to_safetensors(&[("actor", &params)], "{}").unwrap());
-        assert_eq!(note(&bytes).unwrap(), "{}");
-        let mut back = params.clone();
-        back.numbers.fill(0.0);
-        from_safetensors(&bytes, "actor", &mut back).unwrap();
-        assert_eq!(back, params);
-        assert_eq!(back.sha256(), params.sha256());
+        assert_eq!(Params::load(layout(), &bytes, "actor").unwrap(), params);
     }
 
     #[test]
-    fn another_layout_is_refused_by_name() {
-        let params = drawn();
-        let bytes = to_safetensors(&[("actor", &params)], "").unwrap();
-        let mut other = params.clone();
-        other.entries[0].shape = vec![8, 4];
-        assert!(from_safetensors(&bytes, "actor", &mut other).unwrap_err().to_string().contains("actor.a"));
-        assert!(from_safetensors(&bytes[..40], "actor", &mut params.clone()).is_err());
+    fn another_layout_is_rejected_by_name() {
+        let bytes = to_safetensors(&[("actor", &drawn())], "").unwrap();
+        let mut other = layout();
+        other[0].shape = vec![8, 4];
+        assert!(Params::load(other, &bytes, "actor").unwrap_err().to_string().contains("actor.a"));
+        assert!(Params::load(layout(), &bytes, "critic").unwrap_err().to_string().contains("critic.a is missing"));
+        assert!(Params::load(layout(), &bytes[..40], "actor").is_err());
+        let mut builder = ParamBuilder::with(drawn().tensors().unwrap());
+        assert!(builder.tensor("a", &[8, 4], Init::Constant(0.0)).is_err());
     }
 }

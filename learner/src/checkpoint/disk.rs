@@ -44,7 +44,7 @@ impl Disk for FileSystem {
     }
 }
 
-/// Replaces a file as a whole: whoever looks sees the old one or the new one, also after a kill or a power cut.
+/// Replaces a file as a whole: a reader sees the old one or the new one, also after a kill or a power cut.
 pub fn replace_file(disk: &mut dyn Disk, folder: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {
     let temporary = folder.join(format!(".{name}.tmp"));
     let written = disk.write(&temporary, bytes).and_then(|()| disk.sync(&temporary));

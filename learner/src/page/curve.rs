@@ -15,7 +15,7 @@ const COLUMNS: [(&str, &str); 17] = [
     ("policy_loss", "/executor/policy_loss"),
     ("value_loss", "/executor/value_loss"),
     ("entropy", "/executor/entropy"),
-    ("divergence", "/executor/divergence"),
+    ("approx_kl", "/executor/approx_kl"),
     ("actor_grad_norm", "/executor/actor_grad_norm"),
     ("critic_grad_norm", "/executor/critic_grad_norm"),
     ("commander_loss", "/commander/loss"),

@@ -8,7 +8,7 @@ use crate::report::means::{ClosingMeans, EvalSummary, IterationMeans};
 use crate::report::observer::RunObserver;
 use crate::run_events::IterationReport;
 use crate::train::commander_ppo::CommanderStats;
-use crate::train::mappo::UpdateStats;
+use crate::train::stats::UpdateStats;
 use magex_core::config::RunConfig;
 use magex_core::metrics_table::SUCCESS_RATE;
 use serde::{Deserialize, Serialize};
@@ -89,8 +89,8 @@ impl IterationMetrics {
             joint_env_steps: progress.joint_env_steps,
             agent_steps: progress.joint_env_steps * config.task.agents as u64,
             episodes: IterationMeans { greedy: evaluation, sampled: training },
+            commander: updates.as_ref().map(|u| u.1),
             executor: updates.map(|u| u.0),
-            commander: updates.map(|u| u.1),
             timing,
             joint_steps_per_s: steps / seconds.max(1e-9),
             wall_s,

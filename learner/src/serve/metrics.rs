@@ -164,8 +164,8 @@ impl LearnerMetrics {
         for (stage, seconds) in Stage::ALL.iter().zip([actor_s, learner_s, network_s]) {
             self.bottleneck_seconds.with(&[stage.name()]).set(seconds);
         }
-        if let Some(update) = &metrics.executor {
-            self.skipped.add(update.skipped as u64);
+        if let Some(skipped) = metrics.executor.as_ref().and_then(|update| update.get("skipped_minibatches")) {
+            self.skipped.add(skipped as u64);
         }
         if let Some(success) = metrics.episodes.get(SUCCESS_RATE) {
             self.success.set(success);

@@ -1,13 +1,14 @@
-//! Adam (Kingma & Ba 2015) with global-norm clipping, on flat parameters, with moments that can be checkpointed.
+//! Adam (Kingma & Ba 2015) with global-norm clipping, on flat parameters. candle-nn's `AdamW` keeps its moments and its step
+//! counter private, so a checkpoint could not hold them, and takes one gradient store where ours are sums over slices.
 
 use serde::{Deserialize, Serialize};
 
 /// First and second moments of one network's gradient.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
-    /// m, one number per parameter.
+    /// m, one value per parameter.
     pub first: Vec<f32>,
-    /// v, one number per parameter.
+    /// v, one value per parameter.
     pub second: Vec<f32>,
     /// Updates done.
     pub steps: u64,

@@ -1,10 +1,14 @@
 //! An iteration's trajectories as the update wants them: episode by episode, features computed once.
 
+use candle_core::{Device, Result as CandleResult, Tensor};
 use magex_core::keys::episode_keys;
 use magex_core::rng::sequence;
 use magex_core::trajectory::{Shape, Trajectory};
+use magex_nets::executor::Input;
 use magex_nets::features::{FeatureSpec, Features, JointStates};
+use magex_nets::ops::GraphNoise;
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// E episodes of T steps of N agents. Rows of `features` are ordered [E, T+1, N], everything else [E, T, N].
 #[derive(Debug)]
@@ -98,6 +102,59 @@ impl Batch {
         }
         out
     }
+}
+
+/// Some chunks of a batch, whose rows are ordered [L, C, N].
+pub(crate) struct Slice<'a> {
+    pub(crate) batch: &'a Batch,
+    /// (episode, first step) of each chunk.
+    pub(crate) units: &'a [(usize, usize)],
+    /// L.
+    pub(crate) chunk: usize,
+    /// Agent samples of the whole minibatch.
+    pub(crate) samples: f32,
+}
+
+impl Slice<'_> {
+    pub(crate) fn features(&self) -> Features {
+        self.batch.gather(self.units, self.chunk)
+    }
+
+    pub(crate) fn input<'f>(&self, features: &'f Features, hidden: Vec<f32>, noise: GraphNoise) -> Input<'f> {
+        let (sequences, agents) = (self.units.len(), self.batch.shape.agents);
+        Input { steps: self.chunk, sequences, agents, features, hidden, noise }
+    }
+
+    pub(crate) fn noise(&self) -> GraphNoise {
+        GraphNoise::Keyed(Arc::new(self.batch.noise_keys(self.units, self.chunk)))
+    }
+
+    pub(crate) fn actions(&self) -> Vec<u8> {
+        self.batch.rows(&self.batch.actions, self.batch.shape.action_components, self.units, self.chunk)
+    }
+
+    /// The rows of a [E, T, N] array.
+    pub(crate) fn column(&self, values: &[f32]) -> CandleResult<Tensor> {
+        column(self.batch.rows(values, 1, self.units, self.chunk))
+    }
+
+    /// [C·N·H] memories entering the chunks, out of the [T/L, N, H] of each episode.
+    pub(crate) fn memories<'m>(&self, of: impl Fn(usize) -> &'m [f32]) -> Vec<f32> {
+        let mut out = Vec::new();
+        for &(episode, start) in self.units {
+            let memory = of(episode);
+            let width = memory.len() / (self.batch.shape.steps / self.chunk);
+            let at = start / self.chunk * width;
+            out.extend_from_slice(&memory[at..at + width]);
+        }
+        out
+    }
+}
+
+/// A vector without a gradient.
+pub(crate) fn column(values: Vec<f32>) -> CandleResult<Tensor> {
+    let rows = values.len();
+    Tensor::from_vec(values, rows, &Device::Cpu)
 }
 
 /// Features of all T+1 states of one episode of a trajectory.

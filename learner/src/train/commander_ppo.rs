@@ -8,27 +8,23 @@ mod imitation;
 #[cfg(test)]
 mod tests;
 
-use crate::train::adam::Adam;
-use candle_core::{DType, Device, Tensor, Var};
+use crate::train::batch::column;
+use crate::train::learned::{Learned, Network};
+use crate::train::mappo::clipped_surrogate;
+use candle_core::{Tensor, Var};
 use magex_core::config::CommanderConfig;
 use magex_core::keys::random_goals;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Group, Stage, TaskConfig};
 use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
-use magex_nets::ops::Pick;
-use magex_nets::params::Params;
+use magex_nets::ops::{self, Pick};
+use magex_nets::params::{ParamBuilder, ParamError};
 
 pub use imitation::Lesson;
 
-/// Everything that learning changes.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CommanderState {
-    /// Scheduler network; empty if the scheduler is not learned.
-    pub params: Params,
-    /// Moments of its gradient.
-    pub adam: Adam,
-}
+/// Name of the scheduler's network.
+const NAME: &str = "commander";
 
 /// One team and what was decided for it.
 #[derive(Debug, Clone)]
@@ -72,16 +68,21 @@ impl CommanderPpo {
         Self { config: config.clone(), agents: task.agents, dims: task.dims(), stages: task.stages(), seed }
     }
 
-    /// Fresh network and optimiser.
-    pub fn start(&self) -> Result<CommanderState, CommanderError> {
-        let params = Commander::start(&self.config, self.agents, self.dims, self.seed)?;
-        Ok(CommanderState { adam: Adam::new(params.numbers.len()), params })
+    /// Initial network and optimiser; without parameters if the scheduler is not learned.
+    pub fn init(&self) -> Result<Network, ParamError> {
+        let params = Commander::init(&self.config, self.agents, self.dims, self.seed)?;
+        Ok(Network::new(NAME, params, true))
+    }
+
+    /// The scheduler with the parameters of a network, as constants.
+    pub fn commander(&self, network: &Network) -> Result<Commander, ParamError> {
+        Commander::of(&self.config, self.agents, self.dims, &network.params)
     }
 
     /// One update on the decisions of an iteration's episodes. Does nothing if the scheduler is not learned.
     pub fn update(
         &self,
-        state: &mut CommanderState,
+        learned: &mut Learned,
         trajectories: &[Trajectory],
         iteration: u32,
         progress_rate: f64,
@@ -89,8 +90,9 @@ impl CommanderPpo {
         if !self.config.kind.learned() {
             return Ok(CommanderStats::default());
         }
-        let commander =
-            Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(state.params.plain()?))?;
+        let missing = || ParamError::Mismatch(format!("there is no network named {NAME}"));
+        let network = learned.networks.iter_mut().find(|network| network.name == NAME).ok_or_else(missing)?;
+        let commander = self.commander(network)?;
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
         for t in trajectories {
@@ -131,7 +133,7 @@ impl CommanderPpo {
         if samples.is_empty() {
             return Ok(CommanderStats { skipped, ..CommanderStats::default() });
         }
-        let mut stats = self.improve(state, &samples, iteration, progress_rate)?;
+        let mut stats = self.improve(network, &samples, iteration, progress_rate)?;
         stats.greedy_cost_ratio = ratio_sum / samples.len().max(1) as f64;
         stats.first_ratio_error = error;
         stats.skipped += skipped;
@@ -141,7 +143,7 @@ impl CommanderPpo {
     /// PPO epochs over given samples.
     pub fn improve(
         &self,
-        state: &mut CommanderState,
+        network: &mut Network,
         samples: &[Sample],
         iteration: u32,
         progress_rate: f64,
@@ -150,16 +152,14 @@ impl CommanderPpo {
         // Scaled, not centred: the self-critical baseline already is the centre.
         let square = samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>() / samples.len().max(1) as f64;
         let scale = (1.0 / (square.sqrt() + 1e-6)) as f32;
-        let old = self.log_probs_of(state, samples)?;
+        let old = self.log_probs_of(network, samples)?;
         let mut stats = CommanderStats::default();
         let mut count = 0.0;
         for epoch in 0..c.epochs {
             let mut order: Vec<usize> = (0..samples.len()).collect();
             Key::new(self.seed, Purpose::Shuffle, &[iteration, epoch as u32, 1]).stream().shuffle(&mut order);
             for minibatch in order.chunks(c.minibatch) {
-                let variables = state.params.variables()?;
-                let tensors = variables.iter().map(|v: &Var| v.as_tensor().clone()).collect();
-                let commander = Commander::build(c, self.agents, self.dims, &mut state.params.source(tensors))?;
+                let (commander, variables) = self.differentiable(network)?;
                 let instances: Vec<Instance> = minibatch.iter().map(|&i| samples[i].instance.clone()).collect();
                 let picks: Vec<Vec<Pick>> = minibatch.iter().map(|&i| samples[i].picks.clone()).collect();
                 let now = commander.pick_log_probs(&instances, &picks)?;
@@ -169,11 +169,8 @@ impl CommanderPpo {
                     .iter()
                     .flat_map(|&i| std::iter::repeat_n(samples[i].advantage * scale, samples[i].picks.len()))
                     .collect();
-                let (old, advantage) =
-                    (Tensor::from_vec(old, rows, &Device::Cpu)?, Tensor::from_vec(advantage, rows, &Device::Cpu)?);
-                let ratio = (now.get(0)? - old)?.exp()?;
-                let (low, high) = (f64::from(1.0 - c.clip), f64::from(1.0 + c.clip));
-                let surrogate = (&ratio * &advantage)?.minimum(&(ratio.clamp(low, high)? * &advantage)?)?;
+                let ratio = ops::exp(&(now.get(0)? - column(old)?)?)?;
+                let surrogate = clipped_surrogate(&ratio, &column(advantage)?, c.clip)?;
                 let mean = |x: Tensor| -> candle_core::Result<Tensor> { x.sum_all()?.affine(1.0 / rows as f64, 0.0) };
                 let (surrogate, entropy) = (mean(surrogate)?, mean(now.get(1)?)?);
                 let loss = (surrogate.neg()? - (&entropy * f64::from(c.entropy))?)?;
@@ -181,7 +178,7 @@ impl CommanderPpo {
                 // Adam takes no step along a gradient that is not finite.
                 let usable = surrogate.is_finite()
                     && entropy.is_finite()
-                    && self.descend(state, &variables, &loss, progress_rate)?.is_finite();
+                    && self.descend(network, &variables, &loss, progress_rate)?.is_finite();
                 if !usable {
                     stats.skipped += 1.0;
                     continue;
@@ -196,32 +193,31 @@ impl CommanderPpo {
         Ok(stats)
     }
 
+    /// The scheduler on variables.
+    fn differentiable(&self, network: &Network) -> Result<(Commander, Vec<Var>), CommanderError> {
+        let variables = network.params.variables()?;
+        let tensors = variables.iter().map(|v| v.as_tensor().clone()).collect();
+        let params = &mut ParamBuilder::with(tensors);
+        Ok((Commander::build(&self.config, self.agents, self.dims, params)?, variables))
+    }
+
     /// One step of Adam down the gradient of a loss. The gradient's norm.
     fn descend(
         &self,
-        state: &mut CommanderState,
+        network: &mut Network,
         variables: &[Var],
         loss: &Tensor,
         progress_rate: f64,
     ) -> Result<f64, CommanderError> {
-        let gradients = loss.backward()?;
-        let mut flat = Vec::with_capacity(state.params.numbers.len());
-        for variable in variables {
-            let gradient = match gradients.get(variable) {
-                Some(gradient) => gradient.clone(),
-                None => Tensor::zeros(variable.shape(), DType::F32, &Device::Cpu)?,
-            };
-            flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
-        }
+        let gradient = network.params.gradient(variables, &loss.backward()?)?;
         let c = &self.config;
         let (rate, max_norm) = (c.learning_rate * progress_rate, c.max_grad_norm.into());
-        Ok(state.adam.step(&mut state.params.numbers, &flat, rate, 1e-5, max_norm))
+        Ok(network.adam.step(&mut network.params.values, &gradient, rate, 1e-5, max_norm))
     }
 
     /// Log-probabilities of every pick under the present weights.
-    fn log_probs_of(&self, state: &CommanderState, samples: &[Sample]) -> Result<Vec<Vec<f32>>, CommanderError> {
-        let commander =
-            Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(state.params.plain()?))?;
+    fn log_probs_of(&self, network: &Network, samples: &[Sample]) -> Result<Vec<Vec<f32>>, CommanderError> {
+        let commander = self.commander(network)?;
         samples
             .iter()
             .map(|s| {

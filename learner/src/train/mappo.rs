@@ -1,69 +1,42 @@
-//! MAPPO (Yu et al. 2022) for the action executor, from top to bottom: values → advantages → epochs → minibatches →
-//! losses → clipped gradients → Adam. Actor and critic are two networks with two optimisers.
+//! MAPPO (Yu et al. 2022, "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games") for the action executor,
+//! from top to bottom: values → GAE → epochs → minibatches → losses → clipped gradients → Adam.
 //!
-//! Every sum has a fixed order: a minibatch is cut into a fixed number of shards whose gradients are added in order,
-//! however many threads compute them. The number of threads does not reach a number.
+//! | | implementation detail | source |
+//! |---|---|---|
+//! | 1 | one policy and one value function for all agents, each with its Adam (ε = 1e-5) | section 3; on-policy `MPE_runner` |
+//! | 2 | value targets are normalised by running statistics (ValueNorm) | section 5.1; `utils/valuenorm.py` |
+//! | 3 | the statistics take in a minibatch before its targets are normalised | `r_mappo.py`, `cal_value_loss` |
+//! | 4 | advantages by GAE(λ), normalised over the whole batch: (A − mean) / (deviation + 1e-5) | `r_mappo.py`, `train` |
+//! | 5 | few epochs, large minibatches | sections 5.3 and 5.5 |
+//! | 6 | memories are differentiated through chunks of L steps; each chunk enters with the memory of the rollout | appendix; `recurrent_generator` |
+//! | 7 | clipped surrogate over the action of one agent | section 5.4; Schulman et al. 2017, equation 7 |
+//! | 8 | clipped value loss around the old value, Huber loss with δ = 10 | `cal_value_loss` |
+//! | 9 | entropy bonus; gradient clipped by its global norm, network by network | `ppo_update` |
+//! | 10 | orthogonal initialisation, gain 0.01 in the last layer of the policy | `r_actor_critic.py` |
+//! | 11 | the horizon is a time limit: the value of the true last state is bootstrapped | ours (on-policy masks it) |
+//! | 12 | a minibatch is cut into a fixed number of slices whose gradients are added in their order | ours: the number of threads does not reach a number |
+//! | 13 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
-use crate::train::adam::Adam;
-use crate::train::batch::Batch;
+use crate::train::batch::{Batch, Slice, column};
 use crate::train::gae::{Gae, ValueNorm};
-use crate::train::loss::{PolicyRows, PolicyStats, ValueRows, policy_loss, value_loss};
-use candle_core::{Result, Tensor, Var};
-use magex_core::config::{ExecutorKind, RunConfig};
+use crate::train::learned::{Learned, Network};
+use crate::train::stats::UpdateStats;
+use candle_core::{Result as CandleResult, Tensor, Var};
+use magex_core::config::RunConfig;
 use magex_core::rng::{Key, Purpose};
-use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{self, Input, Network};
+use magex_nets::executor::{Model, Part};
 use magex_nets::features::FeatureSpec;
-use magex_nets::ops::GraphNoise;
-use magex_nets::params::{ParamError, Params, Source};
+use magex_nets::ops::{self, GraphNoise};
+use magex_nets::params::{ParamBuilder, ParamError, Params};
 use rayon::prelude::*;
-use std::sync::Arc;
 
-/// Everything that learning changes. A checkpoint holds exactly this (and the commander's counterpart).
-#[derive(Debug, Clone, PartialEq)]
-pub struct ExecutorState {
-    /// Policy network.
-    pub actor: Params,
-    /// Value network.
-    pub critic: Params,
-    /// Moments of the actor's gradient.
-    pub actor_adam: Adam,
-    /// Moments of the critic's gradient.
-    pub critic_adam: Adam,
-    /// Running statistics of returns.
-    pub value_norm: ValueNorm,
-}
-
-/// What an update did; means over all minibatches of all epochs.
-#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
-pub struct UpdateStats {
-    /// Clipped surrogate loss.
-    pub policy_loss: f64,
-    /// Clipped Huber loss in normalised units.
-    pub value_loss: f64,
-    /// Entropy of an agent's action, in nats.
-    pub entropy: f64,
-    /// Share of samples outside the clip range.
-    pub clip_fraction: f64,
-    /// Estimated divergence from the old policy, in nats.
-    pub divergence: f64,
-    /// max |ρ − 1| over the first minibatch, before any step: 0 unless actor and learner disagree.
-    pub first_ratio_error: f64,
-    /// Norm of the actor's gradient before clipping.
-    pub actor_grad_norm: f64,
-    /// Norm of the critic's gradient before clipping.
-    pub critic_grad_norm: f64,
-    /// Minibatches left out because a loss or a gradient was not finite.
-    pub skipped: f64,
-}
+type Result<T> = std::result::Result<T, ParamError>;
 
 /// The algorithm with its settings.
 #[derive(Debug)]
 pub struct Mappo {
     config: RunConfig,
-    spec: FeatureSpec,
-    heads: ActionHeads,
-    agents: usize,
+    model: Model,
     /// L: steps of a chunk; 1 for networks without memory.
     chunk: usize,
 }
@@ -72,85 +45,60 @@ pub struct Mappo {
 struct Evaluation {
     /// [T+1, N] normalised values of one episode.
     values: Vec<f32>,
-    /// [T/L, N, H] memory of the actor entering each chunk.
-    actor_memory: Vec<f32>,
-    /// [T/L, N, H] memory of the critic entering each chunk.
-    critic_memory: Vec<f32>,
-}
-
-/// Which of the two networks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Role {
-    Actor,
-    Critic,
+    /// [T/L, N, H] memory of the policy entering each chunk.
+    policy_memory: Vec<f32>,
+    /// [T/L, N, H] memory of the value function entering each chunk.
+    value_memory: Vec<f32>,
 }
 
 impl Mappo {
     /// Checks that the task's actions fit, and fixes the sizes.
-    pub fn new(config: &RunConfig) -> std::result::Result<Self, ParamError> {
-        let heads = ActionHeads::new(config.task.action_heads())
-            .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))?;
-        Ok(Self {
-            spec: executor::feature_spec(&config.executor, &config.task),
-            heads,
-            agents: config.task.agents,
-            chunk: if config.executor.kind == ExecutorKind::Local { 1 } else { config.mappo.chunk_length },
-            config: config.clone(),
-        })
+    pub fn new(config: &RunConfig) -> Result<Self> {
+        let model = Model::new(config)?;
+        let chunk = if model.memory() == 0 { 1 } else { config.mappo.chunk_length };
+        Ok(Self { config: config.clone(), model, chunk })
     }
 
     /// What the networks see.
     pub fn spec(&self) -> &FeatureSpec {
-        &self.spec
+        self.model.spec()
     }
 
-    /// Fresh networks and optimisers.
-    pub fn start(&self) -> std::result::Result<ExecutorState, ParamError> {
-        let draw = |role: Role, index: u32| -> std::result::Result<Params, ParamError> {
-            let mut source = Source::new(Key::new(self.config.run.seed, Purpose::Init, &[index]).stream());
-            self.network(role, &mut source)?;
-            match source {
-                Source::New { params, .. } => Ok(params),
-                Source::Existing { .. } => Err(ParamError::Mismatch("a new source became an existing one".to_owned())),
-            }
+    /// L: steps of a chunk.
+    pub fn chunk(&self) -> usize {
+        self.chunk
+    }
+
+    /// Initial networks and optimisers.
+    pub fn init(&self) -> Result<Vec<Network>> {
+        let key = |index: u32| Key::new(self.config.run.seed, Purpose::Init, &[index]);
+        let parts = self.model.parts().iter().zip(self.model.layouts()?).zip(0..);
+        let init = |((part, layout), index): ((&Part, _), u32)| {
+            Network::new(part.name, Params::init(layout, key(index).stream()), part.policy)
         };
-        let (actor, critic) = (draw(Role::Actor, 0)?, draw(Role::Critic, 1)?);
-        Ok(ExecutorState {
-            actor_adam: Adam::new(actor.numbers.len()),
-            critic_adam: Adam::new(critic.numbers.len()),
-            value_norm: ValueNorm::new(self.config.mappo.value_norm),
-            actor,
-            critic,
-        })
+        Ok(parts.map(init).collect())
     }
 
-    fn network(&self, role: Role, source: &mut Source<'_>) -> std::result::Result<Box<dyn Network>, ParamError> {
-        let (outputs, gain) = match role {
-            Role::Actor => (self.heads.logits(), 0.01),
-            Role::Critic => (1, 1.0),
-        };
-        executor::build(&self.config.executor, &self.spec, self.agents, outputs, gain, source)
+    /// Statistics of no returns yet.
+    pub fn value_norm(&self) -> ValueNorm {
+        ValueNorm::new(self.config.mappo.value_norm)
     }
 
-    /// One update of actor and critic on an iteration's batch. `progress` in [0, 1] is the share of the budget spent.
-    pub fn update(
-        &self,
-        state: &mut ExecutorState,
-        batch: &Batch,
-        iteration: u32,
-        progress: f64,
-    ) -> std::result::Result<UpdateStats, ParamError> {
+    /// One update on an iteration's batch. `progress` in [0, 1] is the share of the budget spent.
+    pub fn update(&self, learned: &mut Learned, batch: &Batch, iteration: u32, progress: f64) -> Result<UpdateStats> {
         let m = &self.config.mappo;
         let (steps, episodes, n) = (batch.shape.steps, batch.shape.episodes, batch.shape.agents);
+        let (parts, value_norm) = (self.model.parts(), &mut learned.value_norm);
+        let networks = &mut learned.networks[..parts.len()];
 
         // 1. Values and memories under the weights that collected the batch.
         let evaluations: Vec<Evaluation> = (0..episodes)
             .into_par_iter()
-            .map(|episode| self.evaluate(state, batch, episode))
-            .collect::<std::result::Result<_, _>>()?;
+            .map(|episode| self.evaluate(networks, batch, episode))
+            .collect::<Result<_>>()?;
 
         // 2. Advantages and returns in raw units, with the statistics that the values were made under.
-        let (mean, deviation) = state.value_norm.moments();
+        let (mean, deviation) = value_norm.moments();
         let rows = episodes * steps * n;
         let (mut advantages, mut returns) = (vec![0.0; rows], vec![0.0; rows]);
         let mut old_values = Vec::with_capacity(rows);
@@ -159,13 +107,8 @@ impl Mappo {
             let raw: Vec<f32> = evaluation.values.iter().map(|v| v * deviation + mean).collect();
             let (from, to) = (episode * steps * n, (episode + 1) * steps * n);
             for agent in 0..n {
-                gae.run(
-                    &batch.rewards[from + agent..to],
-                    &raw[agent..],
-                    n,
-                    &mut advantages[from + agent..to],
-                    &mut returns[from + agent..to],
-                );
+                let (advantages, returns) = (&mut advantages[from + agent..to], &mut returns[from + agent..to]);
+                gae.run(&batch.rewards[from + agent..to], &raw[agent..], n, advantages, returns);
             }
             old_values.extend_from_slice(&evaluation.values[..steps * n]);
         }
@@ -177,8 +120,7 @@ impl Mappo {
         let per_minibatch = (m.minibatch_size / (self.chunk * n)).clamp(1, units.len());
         let minibatches = units.len().div_ceil(per_minibatch);
         let decay = if m.linear_decay { 1.0 - progress } else { 1.0 };
-        let mut stats = UpdateStats::default();
-        let mut done = 0.0;
+        let mut total = Totals { grad_norms: vec![0.0; parts.len()], ..Totals::default() };
         for epoch in 0..m.epochs {
             let mut order = units.clone();
             Key::new(self.config.run.seed, Purpose::Shuffle, &[iteration, epoch]).stream().shuffle(&mut order);
@@ -186,246 +128,250 @@ impl Mappo {
                 let units = &order[part(order.len(), minibatches, index)];
                 let samples = (units.len() * self.chunk * n) as f32;
 
-                // 4. Value targets: the statistics take in this minibatch first, as the MAPPO authors do.
-                state.value_norm.update(batch.rows(&returns, 1, units, self.chunk).into_iter());
-                let (mean, deviation) = state.value_norm.moments();
+                // 4. Value targets: the statistics take in this minibatch first.
+                value_norm.update(batch.rows(&returns, 1, units, self.chunk).into_iter());
+                let moments = value_norm.moments();
 
-                // 5. Gradients of both networks, shard by shard.
-                let shards = m.gradient_slices.min(units.len());
-                let jobs: Vec<(Role, usize)> = [Role::Actor, Role::Critic]
-                    .into_iter()
-                    .flat_map(|role| (0..shards).map(move |s| (role, s)))
-                    .collect();
-                let results: Vec<(Vec<f32>, PolicyStats, f64)> = jobs
-                    .into_par_iter()
-                    .map(|(role, shard)| {
-                        let units = &units[part(units.len(), shards, shard)];
-                        let data = ShardData { batch, units, evaluations: &evaluations, scale: 1.0 / samples };
-                        match role {
-                            Role::Actor => self.policy_gradient(state, &data, &advantages),
-                            Role::Critic => self.value_gradient(state, &data, &returns, &old_values, mean, deviation),
-                        }
-                    })
-                    .collect::<std::result::Result<_, _>>()?;
-                let (actor_results, critic_results) = results.split_at(shards);
-                let actor_gradient = sum_in_order(actor_results);
-                let critic_gradient = sum_in_order(critic_results);
+                // 5. Gradients of both losses, slice by slice.
+                let count = m.gradient_slices.min(units.len());
+                let slice = |s| Slice { batch, units: &units[part(units.len(), count, s)], chunk: self.chunk, samples };
+                let slices: Vec<Slice<'_>> = (0..count).map(slice).collect();
+                let policy_loss = |s| self.policy_loss(networks, s, &evaluations, &advantages);
+                let value_loss = |s| self.value_loss(networks, s, &evaluations, &returns, &old_values, moments);
+                let (policy, value) = rayon::join(
+                    || slices.par_iter().map(policy_loss).collect::<Result<Vec<_>>>(),
+                    || slices.par_iter().map(value_loss).collect::<Result<Vec<_>>>(),
+                );
+                let (policy, value) = (policy?, value?);
 
-                // 6. Clip by global norm, step. Where a loss is not finite neither network moves, and where a gradient is not, not
-                // its own; the value statistics have taken the minibatch in by then.
-                let sum = |f: fn(&PolicyStats) -> f64| actor_results.iter().map(|r| f(&r.1)).sum::<f64>();
-                let value_sum = critic_results.iter().map(|r| r.2).sum::<f64>();
-                if !(sum(|s| s.loss).is_finite() && value_sum.is_finite()) {
-                    stats.skipped += 1.0;
+                // 6. If a loss is not finite, skip the update of all networks; `value_norm` has taken in the minibatch by then.
+                let mut sums = PolicySums::default();
+                policy.iter().for_each(|slice| sums.add(&slice.sums));
+                let value_sum = value.iter().map(|slice| slice.sum).sum::<f64>();
+                if !(sums.loss.is_finite() && value_sum.is_finite()) {
+                    total.skipped += 1.0;
                     continue;
                 }
-                let actor_norm = state.actor_adam.step(
-                    &mut state.actor.numbers,
-                    &actor_gradient,
-                    m.actor_learning_rate * decay,
-                    m.adam_epsilon,
-                    m.max_grad_norm.into(),
-                );
-                let critic_norm = state.critic_adam.step(
-                    &mut state.critic.numbers,
-                    &critic_gradient,
-                    m.critic_learning_rate * decay,
-                    m.adam_epsilon,
-                    m.max_grad_norm.into(),
-                );
 
-                // 7. Bookkeeping.
-                if !(actor_norm.is_finite() && critic_norm.is_finite()) {
-                    stats.skipped += 1.0;
+                // 7. Clip by global norm, step. If only the gradient of one network is not finite, skip that network.
+                let mut norms = vec![0.0; parts.len()];
+                for (k, (network, part)) in networks.iter_mut().zip(parts).enumerate() {
+                    let gradients = policy.iter().map(|s| &s.gradients[k]).chain(value.iter().map(|s| &s.gradients[k]));
+                    let rate = if part.policy { m.actor_learning_rate } else { m.critic_learning_rate } * decay;
+                    let (values, limit) = (&mut network.params.values, m.max_grad_norm.into());
+                    norms[k] = network.adam.step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit);
+                }
+                if norms.iter().any(|norm| !norm.is_finite()) {
+                    total.skipped += 1.0;
                     continue;
                 }
-                let samples = f64::from(samples);
-                stats.policy_loss += sum(|s| s.loss) / samples;
-                stats.entropy += sum(|s| s.entropy) / samples;
-                stats.clip_fraction += sum(|s| s.clipped) / samples;
-                stats.divergence += sum(|s| s.divergence) / samples;
-                stats.value_loss += value_sum / samples;
-                stats.actor_grad_norm += actor_norm;
-                stats.critic_grad_norm += critic_norm;
                 if epoch == 0 && index == 0 {
-                    stats.first_ratio_error = actor_results.iter().map(|r| r.1.ratio_error).fold(0.0, f64::max);
+                    total.first_ratio_error = sums.ratio_error;
                 }
-                done += 1.0;
+                total.minibatch(&sums, value_sum, &norms, samples.into());
             }
         }
-        for mean in [
-            &mut stats.policy_loss,
-            &mut stats.value_loss,
-            &mut stats.entropy,
-            &mut stats.clip_fraction,
-            &mut stats.divergence,
-            &mut stats.actor_grad_norm,
-            &mut stats.critic_grad_norm,
-        ] {
-            *mean /= f64::max(done, 1.0);
-        }
-        Ok(stats)
+        Ok(total.stats(parts))
     }
 
     /// Values of all T+1 states of one episode, and the memories entering each chunk, by running both networks through
     /// the episode a chunk at a time.
-    fn evaluate(
-        &self,
-        state: &ExecutorState,
-        batch: &Batch,
-        episode: usize,
-    ) -> std::result::Result<Evaluation, ParamError> {
-        let (steps, n) = (batch.shape.steps, batch.shape.agents);
-        let actor = self.network(Role::Actor, &mut state.actor.source(state.actor.plain()?))?;
-        let critic = self.network(Role::Critic, &mut state.critic.source(state.critic.plain()?))?;
-        let memory = critic.memory();
-        let mut out = Evaluation {
-            values: Vec::with_capacity((steps + 1) * n),
-            actor_memory: Vec::new(),
-            critic_memory: Vec::new(),
-        };
-        let mut critic_hidden = vec![0.0; n * memory];
-        let mut actor_hidden = critic_hidden.clone();
+    fn evaluate(&self, networks: &[Network], batch: &Batch, episode: usize) -> Result<Evaluation> {
+        let (steps, n, memory) = (batch.shape.steps, batch.shape.agents, self.model.memory());
+        let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
+        let constants = || networks.iter().map(constant).collect::<Result<Vec<_>>>();
+        let (policy, value) = (self.model.policy(&mut constants()?)?, self.model.value(&mut constants()?)?);
+        let values = Vec::with_capacity((steps + 1) * n);
+        let mut out = Evaluation { values, policy_memory: Vec::new(), value_memory: Vec::new() };
+        let mut value_hidden = vec![0.0; n * memory];
+        let mut policy_hidden = value_hidden.clone();
         // Networks without memory have no chunks to respect: a chunk's length only bounds the working memory.
         let stride = if memory == 0 { 10 } else { self.chunk };
         let mut start = 0;
         while start <= steps {
             let count = stride.min(steps + 1 - start);
-            let units = [(episode, start)];
-            let features = batch.gather(&units, count);
-            let input = |hidden: &[f32], noise| Input {
-                steps: count,
-                sequences: 1,
-                agents: n,
-                features: &features,
-                hidden: hidden.to_vec(),
-                noise,
-            };
-            let output = critic.forward(&input(&critic_hidden, GraphNoise::Off))?;
+            let slice = Slice { batch, units: &[(episode, start)], chunk: count, samples: 0.0 };
+            let features = slice.features();
+            let output = value.forward(&slice.input(&features, value_hidden.clone(), GraphNoise::Off))?;
             out.values.extend(output.out.flatten_all()?.to_vec1::<f32>()?);
             if memory > 0 && start < steps {
-                out.actor_memory.extend_from_slice(&actor_hidden);
-                out.critic_memory.extend_from_slice(&critic_hidden);
-                critic_hidden = last_state(output.states.as_ref(), critic_hidden)?;
-                let noise = GraphNoise::Keyed(Arc::new(batch.noise_keys(&units, count)));
-                actor_hidden = last_state(actor.forward(&input(&actor_hidden, noise))?.states.as_ref(), actor_hidden)?;
+                out.policy_memory.extend_from_slice(&policy_hidden);
+                out.value_memory.extend_from_slice(&value_hidden);
+                value_hidden = last_state(output.states.as_ref(), value_hidden)?;
+                let input = slice.input(&features, policy_hidden.clone(), slice.noise());
+                policy_hidden = last_state(policy.evaluate(&input, &slice.actions())?.states.as_ref(), policy_hidden)?;
             }
             start += count;
         }
         Ok(out)
     }
 
-    fn policy_gradient(
+    /// Loss of the policy on one slice of a minibatch: −min(ρ A, clip(ρ, 1 ± ε) A) − c H, with the ratio
+    /// ρ = exp(ln π − ln π_old) of the whole action of one agent and H the entropy summed over its components.
+    fn policy_loss(
         &self,
-        state: &ExecutorState,
-        data: &ShardData<'_>,
+        networks: &[Network],
+        slice: &Slice<'_>,
+        evaluations: &[Evaluation],
         advantages: &[f32],
-    ) -> std::result::Result<(Vec<f32>, PolicyStats, f64), ParamError> {
-        let batch = data.batch;
-        let rows = PolicyRows {
-            actions: batch.rows(&batch.actions, batch.shape.action_components, data.units, self.chunk),
-            old_log_probs: batch.rows(&batch.log_probs, 1, data.units, self.chunk),
-            advantages: batch.rows(advantages, 1, data.units, self.chunk),
-        };
-        let noise = GraphNoise::Keyed(Arc::new(batch.noise_keys(data.units, self.chunk)));
-        let mut stats = PolicyStats::default();
-        let gradient = self.gradient(Role::Actor, &state.actor, data, noise, |logits| {
-            let (loss, s) = policy_loss(
-                logits,
-                rows,
-                &self.heads,
-                self.config.mappo.clip_epsilon,
-                self.config.mappo.entropy_coef,
-                data.scale,
-            )?;
-            stats = s;
-            Ok(loss)
-        })?;
-        Ok((gradient, stats, 0.0))
+    ) -> Result<PolicyGradient> {
+        let m = &self.config.mappo;
+        let (variables, mut parts) = self.variables(networks, |part| part.policy)?;
+        let policy = self.model.policy(&mut parts)?;
+        let hidden = slice.memories(|episode| &evaluations[episode].policy_memory);
+        let now = policy.evaluate(&slice.input(&slice.features(), hidden, slice.noise()), &slice.actions())?;
+
+        let log_ratio = (now.log_probs - slice.column(&slice.batch.log_probs)?)?;
+        let ratio = ops::exp(&log_ratio)?;
+        let surrogate = clipped_surrogate(&ratio, &slice.column(advantages)?, m.clip_epsilon)?;
+        // Means over the whole minibatch, so that the gradients of its slices add up.
+        let objective = (&surrogate + (&now.entropies * f64::from(m.entropy_coef))?)?;
+        let loss = (objective.sum_all()? * (-1.0 / f64::from(slice.samples)))?;
+
+        let sums = PolicySums::of(&surrogate, &now.entropies, &ratio, &log_ratio, m.clip_epsilon)?;
+        Ok(PolicyGradient { gradients: gradients(networks, &variables, &loss)?, sums })
     }
 
-    #[allow(clippy::too_many_arguments)] // each is one symbol of the value loss
-    fn value_gradient(
+    /// Loss of the value function on one slice of a minibatch: [`clipped_value_loss`] in normalised units.
+    fn value_loss(
         &self,
-        state: &ExecutorState,
-        data: &ShardData<'_>,
+        networks: &[Network],
+        slice: &Slice<'_>,
+        evaluations: &[Evaluation],
         returns: &[f32],
         old_values: &[f32],
-        mean: f32,
-        deviation: f32,
-    ) -> std::result::Result<(Vec<f32>, PolicyStats, f64), ParamError> {
-        let batch = data.batch;
-        let mut targets = batch.rows(returns, 1, data.units, self.chunk);
-        targets.iter_mut().for_each(|r| *r = (*r - mean) / deviation);
-        let rows = ValueRows { old_values: batch.rows(old_values, 1, data.units, self.chunk), targets };
-        let mut total = 0.0;
+        (mean, deviation): (f32, f32),
+    ) -> Result<ValueGradient> {
         let m = &self.config.mappo;
-        let gradient = self.gradient(Role::Critic, &state.critic, data, GraphNoise::Off, |values| {
-            let (loss, sum) = value_loss(values, rows, m.clip_epsilon, m.huber_delta, data.scale)?;
-            total = sum;
-            Ok(loss)
-        })?;
-        Ok((gradient, PolicyStats::default(), total))
+        let (variables, mut parts) = self.variables(networks, |part| part.value)?;
+        let value = self.model.value(&mut parts)?;
+        let hidden = slice.memories(|episode| &evaluations[episode].value_memory);
+        let values = value.forward(&slice.input(&slice.features(), hidden, GraphNoise::Off))?.out.flatten_all()?;
+
+        let mut targets = slice.batch.rows(returns, 1, slice.units, slice.chunk);
+        targets.iter_mut().for_each(|r| *r = (*r - mean) / deviation);
+        let (targets, old_values) = (column(targets)?, slice.column(old_values)?);
+        let losses = clipped_value_loss(&values, &old_values, &targets, m.clip_epsilon, m.huber_delta)?;
+        let loss = (losses.sum_all()? * (1.0 / f64::from(slice.samples)))?;
+
+        Ok(ValueGradient { gradients: gradients(networks, &variables, &loss)?, sum: sum(&losses)? })
     }
 
-    /// Forward through one network, loss, backward; the gradient as flat as the parameters.
-    fn gradient(
-        &self,
-        role: Role,
-        params: &Params,
-        data: &ShardData<'_>,
-        noise: GraphNoise,
-        loss: impl FnOnce(&Tensor) -> Result<Tensor>,
-    ) -> std::result::Result<Vec<f32>, ParamError> {
-        let variables = params.variables()?;
-        let mut source = params.source(variables.iter().map(|v: &Var| v.as_tensor().clone()).collect());
-        let network = self.network(role, &mut source)?;
-        let features = data.batch.gather(data.units, self.chunk);
-        let n = data.batch.shape.agents;
-        let input = Input {
-            steps: self.chunk,
-            sequences: data.units.len(),
-            agents: n,
-            features: &features,
-            hidden: data.memories(role, n * network.memory(), self.chunk),
-            noise,
-        };
-        let loss = loss(&network.forward(&input)?.out)?;
-        let gradients = loss.backward()?;
-        let mut flat = Vec::with_capacity(params.numbers.len());
-        for (entry, variable) in params.entries.iter().zip(&variables) {
-            match gradients.get(variable) {
-                Some(gradient) => flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?),
-                None => flat.resize(flat.len() + entry.len(), 0.0),
-            }
-        }
-        Ok(flat)
+    /// Variables of the parts that a loss reads (none of the others), and a builder for each part.
+    fn variables(&self, networks: &[Network], reads: fn(&Part) -> bool) -> Result<(Vec<Vec<Var>>, Vec<ParamBuilder>)> {
+        let parts = networks.iter().zip(self.model.parts());
+        let variables =
+            parts.map(|(network, part)| if reads(part) { network.params.variables() } else { Ok(Vec::new()) });
+        let variables = variables.collect::<CandleResult<Vec<Vec<Var>>>>()?;
+        let builder = |vars: &Vec<Var>| ParamBuilder::with(vars.iter().map(|v| v.as_tensor().clone()).collect());
+        let builders = variables.iter().map(builder).collect();
+        Ok((variables, builders))
     }
 }
 
-/// One shard of a minibatch.
-struct ShardData<'a> {
-    batch: &'a Batch,
-    /// (episode, first step) of each chunk.
-    units: &'a [(usize, usize)],
-    evaluations: &'a [Evaluation],
-    /// 1 / samples of the whole minibatch.
-    scale: f32,
+/// min(ρ A, clip(ρ, 1 ± ε) A), element by element.
+pub(crate) fn clipped_surrogate(ratio: &Tensor, advantages: &Tensor, clip: f32) -> CandleResult<Tensor> {
+    let clipped = (ratio.clamp(1.0 - clip, 1.0 + clip)? * advantages)?;
+    (ratio * advantages)?.minimum(&clipped)
 }
 
-impl ShardData<'_> {
-    /// [C·N·H] memories entering the chunks, as they were when the iteration started.
-    fn memories(&self, role: Role, width: usize, chunk: usize) -> Vec<f32> {
-        let mut out = Vec::with_capacity(self.units.len() * width);
-        for &(episode, start) in self.units {
-            let memory = match role {
-                Role::Actor => &self.evaluations[episode].actor_memory,
-                Role::Critic => &self.evaluations[episode].critic_memory,
-            };
-            let at = start / chunk * width;
-            out.extend_from_slice(&memory[at..at + width]);
+/// max( hub(y − V_c), hub(y − V) ) with V_c = V_old + clip(V − V_old, ± ε), element by element.
+fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32, delta: f32) -> CandleResult<Tensor> {
+    let clipped = (old + (values - old)?.clamp(-clip, clip)?)?;
+    huber(&(targets - values)?, delta)?.maximum(&huber(&(targets - clipped)?, delta)?)
+}
+
+/// e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond, element by element (candle-nn's has the mean of them only).
+fn huber(error: &Tensor, delta: f32) -> CandleResult<Tensor> {
+    let size = error.abs()?;
+    let inner = size.minimum(delta)?;
+    let outer = ((size - &inner)? * f64::from(delta))?;
+    (inner.sqr()? * 0.5)? + outer
+}
+
+/// Backward; the gradient of each network as flat as its parameters, empty for networks that the loss does not read.
+fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Result<Vec<Vec<f32>>> {
+    let store = loss.backward()?;
+    let flat = |(network, variables): (&Network, &Vec<Var>)| Ok(network.params.gradient(variables, &store)?);
+    networks.iter().zip(variables).map(flat).collect()
+}
+
+/// What one slice adds to a minibatch.
+struct PolicyGradient {
+    gradients: Vec<Vec<f32>>,
+    sums: PolicySums,
+}
+
+/// What one slice adds to a minibatch.
+struct ValueGradient {
+    gradients: Vec<Vec<f32>>,
+    /// Σ of the value loss over its rows.
+    sum: f64,
+}
+
+/// Sums over rows, in order and in double precision.
+#[derive(Debug, Clone, Copy, Default)]
+struct PolicySums {
+    loss: f64,
+    entropy: f64,
+    /// Rows whose ratio is outside 1 ± ε.
+    clipped: f64,
+    /// Σ (ρ − 1 − ln ρ), the estimator of the KL divergence from the old policy (Schulman's k3).
+    kl: f64,
+    /// max |ρ − 1|.
+    ratio_error: f64,
+}
+
+impl PolicySums {
+    fn of(surrogate: &Tensor, entropies: &Tensor, ratio: &Tensor, log_ratio: &Tensor, clip: f32) -> Result<Self> {
+        let mut sums = Self { loss: -sum(surrogate)?, entropy: sum(entropies)?, ..Self::default() };
+        for (ratio, log_ratio) in ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?) {
+            sums.clipped += f64::from(u8::from((ratio - 1.0).abs() > clip));
+            sums.kl += f64::from(ratio - 1.0 - log_ratio);
+            sums.ratio_error = sums.ratio_error.max(f64::from((ratio - 1.0).abs()));
         }
-        out
+        Ok(sums)
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.loss += other.loss;
+        self.entropy += other.entropy;
+        self.clipped += other.clipped;
+        self.kl += other.kl;
+        self.ratio_error = self.ratio_error.max(other.ratio_error);
+    }
+}
+
+/// Sums over the minibatches of an update.
+#[derive(Default)]
+struct Totals {
+    minibatches: f64,
+    /// Policy loss, value loss, entropy, clip fraction, KL divergence.
+    means: [f64; 5],
+    /// Norm of each network's gradient before clipping.
+    grad_norms: Vec<f64>,
+    first_ratio_error: f64,
+    skipped: f64,
+}
+
+impl Totals {
+    fn minibatch(&mut self, policy: &PolicySums, value: f64, norms: &[f64], samples: f64) {
+        self.minibatches += 1.0;
+        let sums = [policy.loss, value, policy.entropy, policy.clipped, policy.kl];
+        self.means.iter_mut().zip(sums).for_each(|(mean, sum)| *mean += sum / samples);
+        self.grad_norms.iter_mut().zip(norms).for_each(|(total, norm)| *total += norm);
+    }
+
+    fn stats(self, parts: &[Part]) -> UpdateStats {
+        let count = self.minibatches.max(1.0);
+        let mut stats = UpdateStats::default();
+        let names = ["policy_loss", "value_loss", "entropy", "clip_fraction", "approx_kl"];
+        names.into_iter().zip(self.means).for_each(|(name, sum)| stats.push(name, sum / count));
+        stats.push("first_ratio_error", self.first_ratio_error);
+        let norms = parts.iter().zip(&self.grad_norms);
+        norms.for_each(|(part, sum)| stats.push(format!("{}_grad_norm", part.name), sum / count));
+        stats.push("skipped_minibatches", self.skipped);
+        stats
     }
 }
 
@@ -445,10 +391,11 @@ fn part(count: usize, parts: usize, index: usize) -> std::ops::Range<usize> {
     count * index / parts..count * (index + 1) / parts
 }
 
-/// Σ of the shards' gradients, first shard first.
-fn sum_in_order(results: &[(Vec<f32>, PolicyStats, f64)]) -> Vec<f32> {
-    let mut total = results.first().map(|r| r.0.clone()).unwrap_or_default();
-    for (gradient, ..) in results.iter().skip(1) {
+/// Σ of the gradients, first slice first.
+fn sum_in_order<'a>(gradients: impl Iterator<Item = &'a Vec<f32>>) -> Vec<f32> {
+    let mut gradients = gradients.filter(|gradient| !gradient.is_empty());
+    let mut total = gradients.next().cloned().unwrap_or_default();
+    for gradient in gradients {
         for (t, g) in total.iter_mut().zip(gradient) {
             *t += g;
         }
@@ -457,9 +404,17 @@ fn sum_in_order(results: &[(Vec<f32>, PolicyStats, f64)]) -> Vec<f32> {
 }
 
 /// The memory after the last step.
-fn last_state(states: Option<&Tensor>, otherwise: Vec<f32>) -> Result<Vec<f32>> {
+fn last_state(states: Option<&Tensor>, otherwise: Vec<f32>) -> CandleResult<Vec<f32>> {
     match states {
         Some(states) => states.get(states.dim(0)? - 1)?.flatten_all()?.to_vec1::<f32>(),
         None => Ok(otherwise),
     }
 }
+
+/// Σ in order, in double precision.
+fn sum(values: &Tensor) -> CandleResult<f64> {
+    Ok(values.to_vec1::<f32>()?.into_iter().map(f64::from).sum())
+}
+
+#[cfg(test)]
+mod tests;

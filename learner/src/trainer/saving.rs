@@ -87,13 +87,7 @@ impl Trainer {
     pub(super) fn checkpoint(&mut self) -> Result<PathBuf, TrainError> {
         // A checkpoint that survives a power cut has the lines of its iterations.
         self.notify(|observer| observer.sync());
-        let (e, c) = (&self.learned.executor, &self.learned.commander);
-        let progress = Progress {
-            value_norm: e.value_norm,
-            adam_steps: [e.actor_adam.steps, e.critic_adam.steps, c.adam.steps],
-            wall_s: self.wall_s(),
-            ..self.progress.clone()
-        };
+        let progress = Progress { wall_s: self.wall_s(), ..self.progress.clone() };
         Ok(checkpoint::write(&self.folder, &progress, &self.learned, self.config.run.keep_checkpoints)?)
     }
 }

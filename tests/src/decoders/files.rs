@@ -6,9 +6,10 @@ use magex_commander::trained::load_scheduler;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::ShardResult;
-use magex_learner::checkpoint::{self, Learned, Progress, sha256_hex};
+use magex_learner::checkpoint::{self, Progress, sha256_hex};
 use magex_learner::serve::validate::{Limits, validate};
 use magex_learner::train::commander_ppo::CommanderPpo;
+use magex_learner::train::learned::Learned;
 use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
@@ -30,21 +31,18 @@ impl Default for Run {
     fn default() -> Self {
         let config = small(ExecutorKind::Local, 3, 1);
         let toml = config.to_toml().expect("a configuration can be written");
-        let executor = Mappo::new(&config).and_then(|mappo| mappo.start()).expect("a small network");
-        let commander = CommanderPpo::new(&config.commander, &config.task, 1).start().expect("a small commander");
-        let learned = Learned { executor, commander };
+        let mappo = Mappo::new(&config).expect("a small network");
+        let commander = CommanderPpo::new(&config.commander, &config.task, 1);
+        let learned = Learned::init(&mappo, &commander).expect("small networks");
         let limits = Limits::for_task(&config.task, 4);
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress {
-            format: checkpoint::FORMAT,
             run_id: "r".into(),
             config_sha256: "c".into(),
             iteration: 1,
             joint_env_steps: 7,
             on_target: 1,
             wall_s: 0.5,
-            value_norm: learned.executor.value_norm,
-            adam_steps: [3, 4, 5],
         };
         let checkpoint = checkpoint::write(folder.path(), &progress, &learned, 1).expect("a checkpoint");
         Self { config, toml, learned, limits, folder, checkpoint }
@@ -98,7 +96,9 @@ impl Run {
         }
         match checkpoint::read(&folder, &self.learned) {
             Ok((_, learned)) => {
-                assert_eq!(learned.executor.actor.numbers.len(), self.learned.executor.actor.numbers.len())
+                let sizes =
+                    |learned: &Learned| learned.networks.iter().map(|n| n.params.values.len()).collect::<Vec<_>>();
+                assert_eq!(sizes(&learned), sizes(&self.learned));
             }
             Err(error) => assert!(!error.to_string().is_empty()),
         }

@@ -24,6 +24,15 @@ pub struct PushBallConfig {
     pub start_in_line_fraction: f32,
 }
 
+impl PushBallConfig {
+    /// Radius of an agent.
+    pub const AGENT_RADIUS: f64 = 0.1;
+    /// Radius of a ball.
+    pub const BALL_RADIUS: f64 = 0.15;
+    /// An agent touches a ball when their centres are this close.
+    pub const PUSH_DISTANCE: f64 = Self::AGENT_RADIUS + Self::BALL_RADIUS;
+}
+
 impl Default for PushBallConfig {
     fn default() -> Self {
         Self { progress: 2.0, turn_length: 0.25, bonus: 0.1, distance: 0.0, start_in_line_fraction: 0.3 }

@@ -10,7 +10,7 @@ use crate::progress::Progress;
 use crate::settings::{self, Overrides};
 use crate::supervise::{self, Crew};
 use anyhow::Context as _;
-use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_learner::page::{LivePage, RunInfo};
@@ -293,7 +293,7 @@ fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, outpu
     }
     let magex = program();
     output.say(format!("\nNext:\n  {magex} eval {out}"));
-    if job.config.executor.kind != ExecutorKind::Mlp {
+    if !job.config.executor.kind.fixed_team_size() {
         output.say(format!("  {magex} eval {out} --agents {} --scheduler exact", 4 * job.config.task.agents));
     }
     output.say(format!("  open {out}/replay.html and {out}/curve.svg"));

@@ -15,8 +15,8 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
 use magex_learner::checkpoint::sha256_hex;
-use magex_learner::train::commander_ppo::{CommanderPpo, CommanderState, Lesson, Sample, cost, greedy_cost};
-use magex_nets::commander::Commander;
+use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
+use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
 use magex_runtime::exit;
 use serde_json::{Value, json};
@@ -117,20 +117,20 @@ impl Training {
     fn run(&self, output: Output) -> anyhow::Result<u8> {
         let clock = Instant::now();
         let mut metrics = std::fs::File::create(self.out.join("metrics.jsonl")).context("metrics.jsonl")?;
-        let mut state = self.ppo.start()?;
-        let untrained = self.validate(&state)?;
+        let mut network = self.ppo.init()?;
+        let untrained = self.validate(&network)?;
         let mut measured = untrained.clone();
         let TrainCommanderArgs { imitation, ppo, batch, .. } = self.args;
         for (stage, steps) in [("imitation", imitation), ("ppo", ppo)] {
             for step in 0..steps {
                 let rate = 1.0 - f64::from(step) / f64::from(steps);
                 let (loss, entropy) = match stage {
-                    "imitation" => (self.imitate(&mut state, step, rate)?, None),
-                    _ => self.reinforce(&mut state, step, rate).map(|(loss, entropy)| (loss, Some(entropy)))?,
+                    "imitation" => (self.imitate(&mut network, step, rate)?, None),
+                    _ => self.reinforce(&mut network, step, rate).map(|(loss, entropy)| (loss, Some(entropy)))?,
                 };
                 let done = step + 1;
                 if done % steps.div_ceil(MEASUREMENTS / 2).max(1) == 0 || done == steps {
-                    measured = self.validate(&state)?;
+                    measured = self.validate(&network)?;
                     let line = json!({
                         "stage": stage, "step": done, "instances": u64::from(done) * u64::from(batch), "loss": loss,
                         "entropy": entropy, "cost_ratio": named(&measured), "wall_s": clock.elapsed().as_secs_f64(),
@@ -141,7 +141,7 @@ impl Training {
             }
         }
         metrics.sync_all().context("metrics.jsonl")?;
-        let weights = to_safetensors(&[("commander", &state.params)], "{\"format\":1}")?;
+        let weights = to_safetensors(&[("commander", &network.params)], "{\"format\":1}")?;
         let summary = json!({
             "weights_sha256": sha256_hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
             "batch": batch, "synthetic_instances": u64::from(imitation + ppo) * u64::from(batch),
@@ -154,29 +154,24 @@ impl Training {
         Ok(exit::OK)
     }
 
-    fn build(&self, state: &CommanderState) -> anyhow::Result<Commander> {
-        let mut source = state.params.source(state.params.plain()?);
-        Ok(Commander::build(&self.config.commander, self.config.task.agents, 2, &mut source)?)
-    }
-
     fn stream(&self, set: u32, step: u32, k: u32) -> Stream {
         Key::new(self.config.run.seed, Purpose::Instances, &[set, step, k]).stream()
     }
 
-    fn imitate(&self, state: &mut CommanderState, step: u32, rate: f64) -> anyhow::Result<f64> {
-        let commander = self.build(state)?;
+    fn imitate(&self, network: &mut Network, step: u32, rate: f64) -> anyhow::Result<f64> {
+        let commander = self.ppo.commander(network)?;
         let lessons = in_parallel(self.threads, self.args.batch, |k| {
             let team = Synthetic::draw(&mut self.stream(IMITATION, step, k));
             let team = team.team();
             let (exact, _) = exact_points(team.agents, team.goals, 2)?;
             Ok(Lesson::new(&commander, &team, &exact)?)
         })?;
-        Ok(self.ppo.imitate(state, &lessons, rate)?)
+        Ok(self.ppo.imitate(network, &lessons, rate)?)
     }
 
     /// Sampled decisions, their advantage over the greedy ones, and PPO on them.
-    fn reinforce(&self, state: &mut CommanderState, step: u32, rate: f64) -> anyhow::Result<(f64, f64)> {
-        let commander = self.build(state)?;
+    fn reinforce(&self, network: &mut Network, step: u32, rate: f64) -> anyhow::Result<(f64, f64)> {
+        let commander = self.ppo.commander(network)?;
         let samples = in_parallel(self.threads, self.args.batch, |k| {
             let synthetic = Synthetic::draw(&mut self.stream(REWARD, step, k));
             let team = synthetic.team();
@@ -189,13 +184,13 @@ impl Training {
             let advantage = ((greedy - cost(&team, &decision.goals)) / exact) as f32;
             Ok(Sample { instance, picks, advantage })
         })?;
-        let stats = self.ppo.improve(state, &samples, step, rate)?;
+        let stats = self.ppo.improve(network, &samples, step, rate)?;
         Ok((stats.loss, stats.entropy))
     }
 
     /// Mean cost ratio of greedy decisions for each of the validation sizes.
-    fn validate(&self, state: &CommanderState) -> anyhow::Result<Vec<f64>> {
-        let commander = self.build(state)?;
+    fn validate(&self, network: &Network) -> anyhow::Result<Vec<f64>> {
+        let commander = self.ppo.commander(network)?;
         let mut means = Vec::new();
         for n in VALIDATION_SIZES {
             let ratios = in_parallel(self.threads, VALIDATION_INSTANCES, |k| {

@@ -1,8 +1,7 @@
 //! A team as a learned scheduler sees it, and decisions on it: picks, one after the other.
 
 use super::Decision;
-use crate::ops::{MaskedSoftmax, Open, Pick};
-use crate::simd::{LANES, load};
+use crate::ops::{LANES, Mask, MaskedSoftmax, Pick, load};
 use magex_core::rng::Stream;
 use wide::f32x16;
 
@@ -12,15 +11,15 @@ pub struct Instance {
     /// Network input.
     pub(super) features: Vec<f32>,
     /// [rows, columns] what a pair costs more than the row's best (`pairwise` only); the scores are this, refined.
-    pub(super) reduced: Vec<f32>,
+    pub(super) reduced_costs: Vec<f32>,
     /// Places in the score matrix that the network looks at (`pairwise` only), one per row of the features.
-    pub(super) looked_at: Vec<u32>,
+    pub(super) candidates: Vec<u32>,
     /// Rows of the score matrix (1 for `ranking`).
     pub(super) rows: usize,
     /// Columns of the score matrix.
     pub(super) columns: usize,
-    /// Who picks when.
-    pub(super) turns: Turns,
+    /// Which row picks when.
+    pub(super) order: PickOrder,
     /// Column → goal (or agent, when goals pick agents because there are fewer of them).
     pub(super) column_of: Vec<u32>,
     /// Goals pick agents.
@@ -28,15 +27,15 @@ pub struct Instance {
     pub(super) agents: usize,
 }
 
-/// Who picks when.
+/// Which row picks when.
 #[derive(Debug, Clone)]
-pub(super) enum Turns {
+pub(super) enum PickOrder {
     /// One score row for all; these pick in this order.
     Given(Vec<u32>),
-    /// A score row each; the next is whoever has most to lose: the largest difference between the best and the second-best
-    /// reduced cost among the columns that are still free, ties by index. It does not depend on the weights, so the
+    /// A score row each. The row of the largest regret picks next: the difference between its best and its second-best
+    /// reduced cost among the columns that are still free, ties by index. The order does not depend on the weights, so the
     /// likelihood of a decision is that of its picks.
-    MostToLose,
+    LargestRegret,
 }
 
 impl Instance {
@@ -49,11 +48,11 @@ impl Instance {
     pub fn decide(&self, scores: &[f32], mut stream: Option<&mut Stream>) -> (Decision, Vec<Pick>) {
         let mut decision =
             Decision { goals: vec![u32::MAX; self.agents], log_prob: 0.0, probabilities: vec![0.0; self.agents] };
-        let picks = self.pick_in_turn(|row, who, open| {
+        let picks = self.pick_in_turn(|row, picker, mask| {
             let scores = &scores[row * self.columns..(row + 1) * self.columns];
-            let softmax = MaskedSoftmax::of(scores, open);
+            let softmax = MaskedSoftmax::of(scores, mask);
             let free = || {
-                scores.iter().zip(open).enumerate().filter(|(_, (_, open))| **open == 0.0).map(|(j, (x, _))| (j, *x))
+                scores.iter().zip(mask).enumerate().filter(|(_, (_, mask))| **mask == 0.0).map(|(j, (x, _))| (j, *x))
             };
             let best = free().find(|(_, x)| *x == softmax.max).map_or(0, |(j, _)| j);
             let column = match &mut stream {
@@ -72,12 +71,12 @@ impl Instance {
             let log_prob = softmax.log_prob(scores[column]);
             decision.log_prob += log_prob;
             let target = self.column_of[column];
-            let (agent, goal) = if self.swapped { (target, who) } else { (who, target) };
+            let (agent, goal) = if self.swapped { (target, picker) } else { (picker, target) };
             decision.goals[agent as usize] = goal;
             decision.probabilities[agent as usize] = libm::expf(log_prob);
             Some(column)
         });
-        // Every turn finds a column: there are at least as many as turns.
+        // Every turn finds a column: there are at least as many columns as turns.
         (decision, picks.unwrap_or_default())
     }
 
@@ -93,34 +92,34 @@ impl Instance {
                 *agent_of.get_mut(goal as usize)? = agent as u32;
             }
         }
-        self.pick_in_turn(|_, who, open| {
-            let target = if self.swapped { agent_of.get(who as usize) } else { goals.get(who as usize) };
+        self.pick_in_turn(|_, picker, mask| {
+            let target = if self.swapped { agent_of.get(picker as usize) } else { goals.get(picker as usize) };
             let column = *column_with.get(*target? as usize)?;
-            (open.get(column) == Some(&0.0)).then_some(column)
+            (mask.get(column) == Some(&0.0)).then_some(column)
         })
     }
 
-    /// Lets everybody pick: `pick` is told the score row, whose turn it is, and what is free.
-    fn pick_in_turn(&self, mut pick: impl FnMut(usize, u32, &Open) -> Option<usize>) -> Option<Vec<Pick>> {
-        let mut open = vec![0.0; self.columns];
+    /// Calls `pick` once for every picker, with its score row, its index and the mask of free columns.
+    fn pick_in_turn(&self, mut pick: impl FnMut(usize, u32, &Mask) -> Option<usize>) -> Option<Vec<Pick>> {
+        let mut mask = vec![0.0; self.columns];
         let mut picks = Vec::with_capacity(self.rows);
-        let mut step = |row: usize, who: u32, open: &mut Vec<f32>| {
-            let column = pick(row, who, open)?;
-            open[column] = f32::NEG_INFINITY;
+        let mut step = |row: usize, picker: u32, mask: &mut Vec<f32>| {
+            let column = pick(row, picker, mask)?;
+            mask[column] = f32::NEG_INFINITY;
             picks.push(Pick { row: row as u32, column: column as u32 });
             Some(column)
         };
-        match &self.turns {
-            Turns::Given(order) => {
-                for &who in order {
-                    step(0, who, &mut open)?;
+        match &self.order {
+            PickOrder::Given(order) => {
+                for &picker in order {
+                    step(0, picker, &mut mask)?;
                 }
             }
-            Turns::MostToLose => {
-                let mut losses = Losses::new(&self.reduced, self.columns);
-                while let Some(row) = losses.largest() {
-                    let column = step(row, row as u32, &mut open)?;
-                    losses.taken(row, column, &open);
+            PickOrder::LargestRegret => {
+                let mut regrets = Regrets::new(&self.reduced_costs, self.columns);
+                while let Some(row) = regrets.largest() {
+                    let column = step(row, row as u32, &mut mask)?;
+                    regrets.taken(row, column, &mask);
                 }
             }
         }
@@ -128,66 +127,66 @@ impl Instance {
     }
 }
 
-/// What every row that has not picked yet loses if it has to do with its second-best free column.
-struct Losses<'a> {
-    reduced: &'a [f32],
+/// The regret of every row that has not picked yet: what its second-best free column costs more than its best.
+struct Regrets<'a> {
+    reduced_costs: &'a [f32],
     columns: usize,
     /// `[rows]` second-best reduced cost; −∞ for rows that have picked.
     second: Vec<f32>,
     /// `[rows]` second best − best; −∞ for rows that have picked.
-    loss: Vec<f32>,
+    regret: Vec<f32>,
 }
 
-impl<'a> Losses<'a> {
-    fn new(reduced: &'a [f32], columns: usize) -> Self {
-        let open = vec![0.0; columns];
-        let (second, loss) = reduced.chunks_exact(columns).map(|row| Self::of(row, &open)).unzip();
-        Self { reduced, columns, second, loss }
+impl<'a> Regrets<'a> {
+    fn new(reduced_costs: &'a [f32], columns: usize) -> Self {
+        let mask = vec![0.0; columns];
+        let (second, regret) = reduced_costs.chunks_exact(columns).map(|row| Self::of(row, &mask)).unzip();
+        Self { reduced_costs, columns, second, regret }
     }
 
-    fn of(row: &[f32], open: &Open) -> (f32, f32) {
-        let (best, second) = two_least(row, open);
+    fn of(row: &[f32], mask: &Mask) -> (f32, f32) {
+        let (best, second) = two_least(row, mask);
         (second, second - best)
     }
 
     fn largest(&self) -> Option<usize> {
         let mut largest = (None, f32::NEG_INFINITY);
-        for (row, &loss) in self.loss.iter().enumerate() {
-            if loss > largest.1 {
-                largest = (Some(row), loss);
+        for (row, &regret) in self.regret.iter().enumerate() {
+            if regret > largest.1 {
+                largest = (Some(row), regret);
             }
         }
         largest.0
     }
 
-    /// A row has taken a column: rows for which it was among the best two look again.
-    fn taken(&mut self, row: usize, column: usize, open: &Open) {
-        (self.second[row], self.loss[row]) = (f32::NEG_INFINITY, f32::NEG_INFINITY);
-        let rows = self.reduced.chunks_exact(self.columns);
-        for ((costs, second), loss) in rows.zip(&mut self.second).zip(&mut self.loss) {
+    /// A row has taken a column: the regret of rows for which it was among the best two is computed anew.
+    fn taken(&mut self, row: usize, column: usize, mask: &Mask) {
+        (self.second[row], self.regret[row]) = (f32::NEG_INFINITY, f32::NEG_INFINITY);
+        let rows = self.reduced_costs.chunks_exact(self.columns);
+        for ((costs, second), regret) in rows.zip(&mut self.second).zip(&mut self.regret) {
             if costs[column] <= *second {
-                (*second, *loss) = Self::of(costs, open);
+                (*second, *regret) = Self::of(costs, mask);
             }
         }
     }
 }
 
 /// The two smallest numbers of a row at free columns; f32::MAX where there is none.
-fn two_least(row: &[f32], open: &Open) -> (f32, f32) {
+fn two_least(row: &[f32], mask: &Mask) -> (f32, f32) {
     let (mut least, mut second) = (f32x16::splat(f32::MAX), f32x16::splat(f32::MAX));
     let mut look = |value: f32x16| {
         second = second.fast_min(least.fast_max(value));
         least = least.fast_min(value);
     };
-    for (row, open) in row.as_chunks::<LANES>().0.iter().zip(open.as_chunks::<LANES>().0) {
+    for (row, mask) in row.as_chunks::<LANES>().0.iter().zip(mask.as_chunks::<LANES>().0) {
         // Taken columns become +∞.
-        look(f32x16::new(*row) - f32x16::new(*open));
+        look(f32x16::new(*row) - f32x16::new(*mask));
     }
-    let (row, open) = (row.as_chunks::<LANES>().1, open.as_chunks::<LANES>().1);
+    let (row, mask) = (row.as_chunks::<LANES>().1, mask.as_chunks::<LANES>().1);
     if !row.is_empty() {
         let mut rest = [f32::MAX; LANES];
-        for ((slot, value), open) in rest.iter_mut().zip(row).zip(open) {
-            *slot = value - open;
+        for ((slot, value), mask) in rest.iter_mut().zip(row).zip(mask) {
+            *slot = value - mask;
         }
         look(load(&rest));
     }
@@ -202,26 +201,26 @@ mod tests {
     use super::*;
     use magex_core::rng::{Key, Purpose};
 
-    /// Everybody looks at everything before every pick.
-    fn order_by_looking_again(
-        reduced: &[f32],
+    /// The regret of every row is computed anew before every pick.
+    fn order_by_recomputation(
+        reduced_costs: &[f32],
         columns: usize,
-        mut pick: impl FnMut(usize, &Open) -> usize,
+        mut pick: impl FnMut(usize, &Mask) -> usize,
     ) -> Vec<Pick> {
-        let (rows, mut open, mut picks) = (reduced.len() / columns, vec![0.0; columns], Vec::new());
+        let (rows, mut mask, mut picks) = (reduced_costs.len() / columns, vec![0.0; columns], Vec::new());
         while picks.len() < rows {
             let (mut next, mut most) = (usize::MAX, f32::NEG_INFINITY);
             for row in (0..rows).filter(|&row| picks.iter().all(|p: &Pick| p.row as usize != row)) {
                 let mut free: Vec<f32> =
-                    (0..columns).filter(|&j| open[j] == 0.0).map(|j| reduced[row * columns + j]).collect();
+                    (0..columns).filter(|&j| mask[j] == 0.0).map(|j| reduced_costs[row * columns + j]).collect();
                 free.sort_by(f32::total_cmp);
-                let loss = free.get(1).copied().unwrap_or(f32::MAX) - free[0];
-                if loss > most {
-                    (next, most) = (row, loss);
+                let regret = free.get(1).copied().unwrap_or(f32::MAX) - free[0];
+                if regret > most {
+                    (next, most) = (row, regret);
                 }
             }
-            let column = pick(next, &open);
-            open[column] = f32::NEG_INFINITY;
+            let column = pick(next, &mask);
+            mask[column] = f32::NEG_INFINITY;
             picks.push(Pick { row: next as u32, column: column as u32 });
         }
         picks
@@ -233,23 +232,23 @@ mod tests {
             // Few values, so that there are ties; and many.
             for values in [3, 1000] {
                 let mut stream = Key::new(4, Purpose::Instances, &[case as u32, values]).stream();
-                let reduced: Vec<f32> = (0..rows * columns).map(|_| stream.below(values) as f32).collect();
+                let reduced_costs: Vec<f32> = (0..rows * columns).map(|_| stream.below(values) as f32).collect();
                 let instance = Instance {
                     features: Vec::new(),
-                    reduced: reduced.clone(),
-                    looked_at: Vec::new(),
+                    reduced_costs: reduced_costs.clone(),
+                    candidates: Vec::new(),
                     rows,
                     columns,
-                    turns: Turns::MostToLose,
+                    order: PickOrder::LargestRegret,
                     column_of: (0..columns as u32).collect(),
                     swapped: false,
                     agents: rows,
                 };
                 // Not always the best: the order must follow what was really taken.
                 let pick =
-                    |row: usize, open: &Open| (0..columns).map(|j| (j + 3 * row) % columns).find(|&j| open[j] == 0.0);
-                let expected = order_by_looking_again(&reduced, columns, |row, open| pick(row, open).unwrap());
-                let found = instance.pick_in_turn(|row, _, open| pick(row, open)).unwrap();
+                    |row: usize, mask: &Mask| (0..columns).map(|j| (j + 3 * row) % columns).find(|&j| mask[j] == 0.0);
+                let expected = order_by_recomputation(&reduced_costs, columns, |row, mask| pick(row, mask).unwrap());
+                let found = instance.pick_in_turn(|row, _, mask| pick(row, mask)).unwrap();
                 assert_eq!(found, expected, "{rows} x {columns}, {values} values");
             }
         }
@@ -261,8 +260,8 @@ mod tests {
         use magex_core::config::CommanderConfig;
         use magex_core::ids::Mode;
         let config = CommanderConfig::default();
-        let params = Commander::start(&config, 50, 2, 1).unwrap();
-        let commander = Commander::build(&config, 50, 2, &mut params.source(params.plain().unwrap())).unwrap();
+        let params = Commander::init(&config, 50, 2, 1).unwrap();
+        let commander = Commander::of(&config, 50, 2, &params).unwrap();
         for (n, g) in [(2, 2), (5, 5), (50, 50), (30, 60), (60, 30), (200, 200)] {
             let mut stream = Key::new(5, Purpose::Instances, &[n as u32, g as u32]).stream();
             let mut draw = |count: usize| (0..2 * count).map(|_| stream.uniform32()).collect::<Vec<f32>>();

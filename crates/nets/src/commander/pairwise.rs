@@ -4,19 +4,20 @@
 //! Entropic transport prices say how much worse than a global compromise each pair is; the network refines the pairs that
 //! are among the best of their row, and leaves the others as they are.
 
-use super::instance::Turns;
-use super::{CommanderError, Instance, Team, constant};
+use super::instance::PickOrder;
+use super::{CommanderError, Instance, Team};
 use crate::executor::{Layer, RELU_GAIN};
-use crate::matmul::Activation;
-use crate::params::{ParamError, Source, Start};
+use crate::ops::{Activation, constant};
+use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
+use candle_nn::Module;
 use magex_assign::duals::{Schedule, sinkhorn_duals};
 
 /// Features of a pair.
 const FEATURES: usize = 10;
 
 /// Pairs of each row that the network looks at: those with the least reduced cost.
-const LOOKED_AT: usize = 4;
+const CANDIDATES: usize = 4;
 
 /// Reduced costs become scores in units of the typical distance between neighbours, mean distance / √rows: a quarter of it is
 /// worth one unit of log-probability at the start of learning.
@@ -32,28 +33,28 @@ pub struct PairwiseNet {
 
 impl PairwiseNet {
     /// 10 → hidden → hidden → 1.
-    pub fn build(hidden: usize, source: &mut Source<'_>) -> Result<Self, ParamError> {
+    pub fn build(hidden: usize, params: &mut ParamBuilder) -> Result<Self, ParamError> {
         Ok(Self {
-            sharpness: source.get("sharpness", &[1], Start::Constant(1.0))?,
-            first: Layer::build(source, "pair.0", (FEATURES, hidden), Activation::Relu, RELU_GAIN)?,
-            second: Layer::build(source, "pair.1", (hidden, hidden), Activation::Relu, RELU_GAIN)?,
-            out: Layer::build(source, "pair.2", (hidden, 1), Activation::Identity, 0.01)?,
+            sharpness: params.tensor("sharpness", &[1], Init::Constant(1.0))?,
+            first: Layer::build(params, "pair.0", (FEATURES, hidden), Activation::Relu, RELU_GAIN)?.on_features(),
+            second: Layer::build(params, "pair.1", (hidden, hidden), Activation::Relu, RELU_GAIN)?,
+            out: Layer::build(params, "pair.2", (hidden, 1), Activation::Identity, 0.01)?,
         })
     }
 
     /// Flat scores of several instances.
     pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
         let cells = instances.iter().map(Instance::cells).sum();
-        let mut reduced = Vec::with_capacity(cells);
+        let mut reduced_costs = Vec::with_capacity(cells);
         let (mut features, mut places) = (Vec::new(), Vec::new());
         for instance in instances {
-            places.extend(instance.looked_at.iter().map(|place| reduced.len() as u32 + place));
-            reduced.extend_from_slice(&instance.reduced);
+            places.extend(instance.candidates.iter().map(|place| reduced_costs.len() as u32 + place));
+            reduced_costs.extend_from_slice(&instance.reduced_costs);
             features.extend_from_slice(&instance.features);
         }
         let x = constant(features, FEATURES)?;
-        let refined = self.out.forward(&self.second.forward(&self.first.forward_constant(&x)?)?)?.flatten_all()?;
-        let scores = Tensor::from_vec(reduced, cells, &Device::Cpu)?.broadcast_mul(&self.sharpness.neg()?)?;
+        let refined = self.out.forward(&self.second.forward(&self.first.forward(&x)?)?)?.flatten_all()?;
+        let scores = Tensor::from_vec(reduced_costs, cells, &Device::Cpu)?.broadcast_mul(&self.sharpness.neg()?)?;
         let places = Tensor::from_vec(places, refined.elem_count(), &Device::Cpu)?;
         scores.index_add(&places, &refined, 0)
     }
@@ -68,17 +69,17 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
     let swapped = n > g;
     let (rows, columns) = (n.min(g), n.max(g));
     let cost = distances(team, swapped)?;
-    // Options that nobody takes must have a price, too: pickers that do not exist take them for nothing. Without them
-    // everybody would have to spread over all options.
+    // Options that stay free need a price, too: imaginary pickers take them at no cost. Without these the pickers would have
+    // to spread over all options.
     let mut filled = cost.clone();
     filled.resize(columns * columns, 0.0);
     let duals = sinkhorn_duals(&filled, columns, columns, &Schedule::for_pairs(filled.len()))?;
     let mean = (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12) as f32;
     let spacing = mean / (rows as f32).sqrt();
     let unit = MAGNIFY / spacing;
-    let mut reduced = cost;
+    let mut reduced_costs = cost;
     let mut row_base = Vec::with_capacity(rows);
-    for (row, u) in reduced.chunks_exact_mut(columns).zip(&duals.rows) {
+    for (row, u) in reduced_costs.chunks_exact_mut(columns).zip(&duals.rows) {
         for (cost, v) in row.iter_mut().zip(&duals.cols) {
             *cost = (*cost - u - v) * unit;
         }
@@ -86,15 +87,15 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
         row.iter_mut().for_each(|value| *value = (*value - least).min(LARGEST));
         row_base.push(least);
     }
-    let (features, looked_at) = features(&reduced, &row_base, columns);
+    let (features, candidates) = features(&reduced_costs, &row_base, columns);
     let column_of = (0..columns as u32).collect();
     Ok(Instance {
         features,
-        reduced,
-        looked_at,
+        reduced_costs,
+        candidates,
         rows,
         columns,
-        turns: Turns::MostToLose,
+        order: PickOrder::LargestRegret,
         column_of,
         swapped,
         agents: n,
@@ -104,7 +105,7 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
 /// Reduced costs are kept below this: beyond it a pair is hopeless anyway.
 const LARGEST: f32 = 1e4;
 
-/// Distances [rows, columns] between those who pick and what they pick.
+/// Distances [rows, columns] between pickers and options.
 fn distances(team: &Team<'_>, swapped: bool) -> Result<Vec<f32>, CommanderError> {
     let d = team.dims;
     let (pickers, options) = if swapped { (team.goals, team.agents) } else { (team.agents, team.goals) };
@@ -131,15 +132,15 @@ fn distances(team: &Team<'_>, swapped: bool) -> Result<Vec<f32>, CommanderError>
     Ok(cost)
 }
 
-/// Features of the pairs that the network looks at, and where those are. `reduced` [rows, columns] is relative to the best of
-/// each row, which is `row_base`.
-fn features(reduced: &[f32], row_base: &[f32], columns: usize) -> (Vec<f32>, Vec<u32>) {
+/// Features of the candidate pairs, and their places in the score matrix. `reduced_costs` [rows, columns] is relative to the
+/// best of each row, which is `row_base`.
+fn features(reduced_costs: &[f32], row_base: &[f32], columns: usize) -> (Vec<f32>, Vec<u32>) {
     let rows = row_base.len();
     // Of every column: the best and second-best among the rows, and how many rows like it best.
     let mut column_best = vec![f32::MAX; columns];
     let mut column_second = vec![f32::MAX; columns];
     let mut wanted = vec![0.0f32; columns];
-    for (row, base) in reduced.chunks_exact(columns).zip(row_base) {
+    for (row, base) in reduced_costs.chunks_exact(columns).zip(row_base) {
         for ((best, second), value) in column_best.iter_mut().zip(&mut column_second).zip(row) {
             let value = value + base;
             let larger = if value < *best { *best } else { value };
@@ -152,10 +153,10 @@ fn features(reduced: &[f32], row_base: &[f32], columns: usize) -> (Vec<f32>, Vec
     }
     let size = libm::logf(rows as f32) / 6.0;
     let crowd = libm::logf(columns as f32 / rows as f32);
-    let count = LOOKED_AT.min(columns);
+    let count = CANDIDATES.min(columns);
     let mut features = Vec::with_capacity(rows * count * FEATURES);
-    let mut looked_at = Vec::with_capacity(rows * count);
-    for (i, (row, base)) in reduced.chunks_exact(columns).zip(row_base).enumerate() {
+    let mut candidates = Vec::with_capacity(rows * count);
+    for (i, (row, base)) in reduced_costs.chunks_exact(columns).zip(row_base).enumerate() {
         let best = least(row);
         let regret = best[1].0.min(LARGEST);
         for (rank, &(value, j)) in best[..count].iter().enumerate() {
@@ -169,14 +170,14 @@ fn features(reduced: &[f32], row_base: &[f32], columns: usize) -> (Vec<f32>, Vec
                 squash(regret),
                 squash(column_regret),
                 (wanted[j] - 1.0).clamp(-1.0, 3.0),
-                rank as f32 / LOOKED_AT as f32,
+                rank as f32 / CANDIDATES as f32,
                 size,
                 crowd.min(2.0),
             ]);
-            looked_at.push((i * columns + j) as u32);
+            candidates.push((i * columns + j) as u32);
         }
     }
-    (features, looked_at)
+    (features, candidates)
 }
 
 /// [0, ∞) → [0, 1), steepest at 0.
@@ -185,11 +186,11 @@ fn squash(x: f32) -> f32 {
 }
 
 /// The smallest of a row with their columns, ascending, ties by column; f32::MAX where the row has no more.
-fn least(row: &[f32]) -> [(f32, usize); LOOKED_AT] {
-    let mut found = [(f32::MAX, 0); LOOKED_AT];
+fn least(row: &[f32]) -> [(f32, usize); CANDIDATES] {
+    let mut found = [(f32::MAX, 0); CANDIDATES];
     for (column, &value) in row.iter().enumerate() {
-        if value < found[LOOKED_AT - 1].0 {
-            let mut place = LOOKED_AT - 1;
+        if value < found[CANDIDATES - 1].0 {
+            let mut place = CANDIDATES - 1;
             while place > 0 && value < found[place - 1].0 {
                 found[place] = found[place - 1];
                 place -= 1;

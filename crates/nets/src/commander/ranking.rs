@@ -4,12 +4,13 @@
 //! Rank r means "agent r", so the order of the indices decides whether there is anything to learn: with shuffled indices
 //! it learns nothing. Agents and goals are therefore put into a canonical spatial order first.
 
-use super::instance::Turns;
-use super::{CommanderError, Instance, Team, constant};
+use super::instance::PickOrder;
+use super::{CommanderError, Instance, Team};
 use crate::executor::Layer;
-use crate::matmul::Activation;
-use crate::params::{ParamError, Source};
+use crate::ops::{self, Activation, constant};
+use crate::params::{ParamBuilder, ParamError};
 use candle_core::{Result as CandleResult, Tensor};
+use candle_nn::Module;
 use magex_core::config::CanonicalOrder;
 
 /// Scores are bounded to ± this, so that no goal's probability vanishes.
@@ -30,15 +31,15 @@ impl RankingNet {
         agents: usize,
         dims: usize,
         order: CanonicalOrder,
-        source: &mut Source<'_>,
+        params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let gain = 5.0 / 3.0;
         let tanh = Activation::Tanh;
         Ok(Self {
             layers: [
-                Layer::build(source, "rank.0", (2 * dims * agents, hidden), tanh, gain)?,
-                Layer::build(source, "rank.1", (hidden, hidden), tanh, gain)?,
-                Layer::build(source, "rank.2", (hidden, agents), Activation::Identity, 0.1)?,
+                Layer::build(params, "rank.0", (2 * dims * agents, hidden), tanh, gain)?.on_features(),
+                Layer::build(params, "rank.1", (hidden, hidden), tanh, gain)?,
+                Layer::build(params, "rank.2", (hidden, agents), Activation::Identity, 0.1)?,
             ],
             agents,
             dims,
@@ -48,11 +49,11 @@ impl RankingNet {
 
     /// [B·N] scores of B instances.
     pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
-        let features = instances.iter().flat_map(|instance| instance.features.iter().copied()).collect();
+        let features: Vec<f32> = instances.iter().flat_map(|instance| instance.features.iter().copied()).collect();
         let x = constant(features, 2 * self.dims * self.agents)?;
-        let hidden = self.layers[1].forward(&self.layers[0].forward_constant(&x)?)?;
+        let hidden = self.layers[1].forward(&self.layers[0].forward(&x)?)?;
         let raw = self.layers[2].forward(&hidden)?;
-        (raw * (1.0 / BOUND))?.tanh()?.affine(BOUND, 0.0)?.flatten_all()
+        ops::tanh(&(raw * (1.0 / BOUND))?)?.affine(BOUND, 0.0)?.flatten_all()
     }
 
     /// Positions relative to their centre, divided by their largest extent, in canonical order.
@@ -82,15 +83,15 @@ impl RankingNet {
         let mut features = Vec::with_capacity(2 * d * n);
         agents.iter().for_each(|&i| features.extend((0..d).map(|k| place(team.agents, i as usize, k))));
         goals.iter().for_each(|&i| features.extend((0..d).map(|k| place(team.goals, i as usize, k))));
-        let (reduced, looked_at) = (Vec::new(), Vec::new());
-        let turns = Turns::Given(agents);
+        let (reduced_costs, candidates) = (Vec::new(), Vec::new());
+        let order = PickOrder::Given(agents);
         Ok(Instance {
             features,
-            reduced,
-            looked_at,
+            reduced_costs,
+            candidates,
             rows: 1,
             columns: n,
-            turns,
+            order,
             column_of: goals,
             swapped: false,
             agents: n,

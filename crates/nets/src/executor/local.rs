@@ -1,11 +1,11 @@
 //! The `local` executor: an agent, its goal and its k nearest neighbours. No graph, no memory.
 
-use super::{Input, Layer, Network, Output, RELU_GAIN, constant};
+use super::{Input, Layer, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::matmul::Activation;
-use crate::ops::neighbour_pool;
-use crate::params::{ParamError, Source, Start};
+use crate::ops::{Activation, constant, neighbour_pool};
+use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
+use candle_nn::Module;
 use magex_core::config::ExecutorConfig;
 use std::sync::Arc;
 
@@ -27,18 +27,18 @@ impl LocalNet {
         spec: &FeatureSpec,
         outputs: usize,
         head_gain: f64,
-        source: &mut Source<'_>,
+        params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let (h, half) = (config.hidden, config.hidden / 2);
         let width = spec.neighbour_width();
         Ok(Self {
-            own: Layer::build(source, "own", (spec.goal_width(), h), Activation::Relu, RELU_GAIN)?,
+            own: Layer::build(params, "own", (spec.goal_width(), h), Activation::Relu, RELU_GAIN)?.on_features(),
             neighbour: (
-                source.get("neighbour.weight", &[width, half], Start::Orthogonal(RELU_GAIN))?,
-                source.get("neighbour.bias", &[half], Start::Constant(0.0))?,
+                params.tensor("neighbour.weight", &[width, half], Init::Orthogonal(RELU_GAIN))?,
+                params.tensor("neighbour.bias", &[half], Init::Constant(0.0))?,
             ),
-            mix: Layer::build(source, "mix", (h + half, h), Activation::Relu, RELU_GAIN)?,
-            head: Layer::build(source, "head", (h, outputs), Activation::Identity, head_gain)?,
+            mix: Layer::build(params, "mix", (h + half, h), Activation::Relu, RELU_GAIN)?,
+            head: Layer::build(params, "head", (h, outputs), Activation::Identity, head_gain)?,
             goal_width: spec.goal_width(),
             neighbours: spec.neighbours,
             neighbour_width: width,
@@ -49,16 +49,12 @@ impl LocalNet {
 impl Network for LocalNet {
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
         let f = input.features;
-        let own = self.own.forward_constant(&constant(&f.goals, self.goal_width)?)?;
+        let own = self.own.forward(&constant(f.goals.as_slice(), self.goal_width)?)?;
         let shape = (f.counts.len(), self.neighbours, self.neighbour_width);
         let neighbours = Tensor::from_slice(&f.neighbours, shape, &Device::Cpu)?;
         let (w, b) = &self.neighbour;
         let team = neighbour_pool(&neighbours, Arc::new(f.counts.clone()), w, b)?;
         let mixed = self.mix.forward(&Tensor::cat(&[&own, &team], 1)?)?;
         Ok(Output { out: self.head.forward(&mixed)?, states: None })
-    }
-
-    fn memory(&self) -> usize {
-        0
     }
 }

@@ -1,11 +1,13 @@
 //! The paper's executor: Subgraph Extractor, Goal Encoder, State Extractor, Action Generator; and its ablations.
 
-use super::{Input, Layer, Network, Output, RELU_GAIN, constant};
+use super::{Input, Layer, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::matmul::Activation;
-use crate::ops::{GraphBlock, graph_block, gru, layer_norm, mean_of_others, neighbour_pool};
-use crate::params::{ParamError, Source, Start};
-use candle_core::{D, DType, Device, Result as CandleResult, Tensor};
+use crate::ops::{
+    Activation, GraphBlock, constant, graph_block, gru, layer_norm, linear, mean_of_others, neighbour_pool, softmax,
+};
+use crate::params::{Init, ParamBuilder, ParamError};
+use candle_core::{DType, Device, Result as CandleResult, Tensor};
+use candle_nn::Module;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use std::sync::Arc;
 
@@ -38,13 +40,15 @@ struct Norm {
 }
 
 impl Norm {
-    fn build(source: &mut Source<'_>, name: &str, width: usize) -> Result<Self, ParamError> {
+    fn build(params: &mut ParamBuilder, name: &str, width: usize) -> Result<Self, ParamError> {
         Ok(Self {
-            scale: source.get(&format!("{name}.scale"), &[width], Start::Constant(1.0))?,
-            shift: source.get(&format!("{name}.shift"), &[width], Start::Constant(0.0))?,
+            scale: params.tensor(&format!("{name}.scale"), &[width], Init::Constant(1.0))?,
+            shift: params.tensor(&format!("{name}.shift"), &[width], Init::Constant(0.0))?,
         })
     }
+}
 
+impl Module for Norm {
     fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
         layer_norm(x, &self.scale, &self.shift)
     }
@@ -76,33 +80,33 @@ impl TeamNet {
         agents: usize,
         outputs: usize,
         head_gain: f64,
-        source: &mut Source<'_>,
+        params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let f = config.feature_size;
         let p = config.pair_hidden;
         let relu = Activation::Relu;
-        let observe = Layer::build(source, "f_o", (spec.node_width(), f), relu, RELU_GAIN)?;
+        let observe = Layer::build(params, "f_o", (spec.node_width(), f), relu, RELU_GAIN)?.on_features();
         let team = match config.kind {
             ExecutorKind::Attention => {
                 let inner = HEADS * HEAD_WIDTH;
                 Team::Attention {
-                    qkv: Layer::build(source, "attention.qkv", (f, 3 * inner), Activation::Identity, 1.0)?,
-                    out: Layer::build(source, "attention.out", (inner, f), Activation::Identity, 1.0)?,
+                    qkv: Layer::build(params, "attention.qkv", (f, 3 * inner), Activation::Identity, 1.0)?,
+                    out: Layer::build(params, "attention.out", (inner, f), Activation::Identity, 1.0)?,
                 }
             }
             ExecutorKind::Mlp => {
-                Team::Concat { mix: Layer::build(source, "concat", (agents * f, f), relu, RELU_GAIN)? }
+                Team::Concat { mix: Layer::build(params, "concat", (agents * f, f), relu, RELU_GAIN)? }
             }
             _ => {
                 let literal = config.kind == ExecutorKind::MagexLiteral;
                 let inputs = if literal { f } else { 2 * f };
-                let encode = Layer::build(source, "gcn", (inputs, f), relu, RELU_GAIN)?;
+                let encode = Layer::build(params, "gcn", (inputs, f), relu, RELU_GAIN)?;
                 let mut blocks = Vec::new();
                 for b in 0..config.graph_blocks {
                     let name = format!("block{b}");
                     blocks.push(Block {
                         project: Layer::build(
-                            source,
+                            params,
                             &format!("{name}.project"),
                             (f, 2 * p + 2 * f),
                             Activation::Identity,
@@ -111,13 +115,13 @@ impl TeamNet {
                         relative: if literal {
                             None
                         } else {
-                            Some(source.get(
+                            Some(params.tensor(
                                 &format!("{name}.relative"),
                                 &[2 * spec.dims, p],
-                                Start::Orthogonal(1.0),
+                                Init::Orthogonal(1.0),
                             )?)
                         },
-                        score: source.get(&format!("{name}.score"), &[p + 1], Start::Orthogonal(0.5))?,
+                        score: params.tensor(&format!("{name}.score"), &[p + 1], Init::Orthogonal(0.5))?,
                         shape: GraphBlock {
                             agents: 0,
                             pair_hidden: p,
@@ -136,8 +140,8 @@ impl TeamNet {
         let encounters = if near {
             let width = spec.neighbour_width();
             Some((
-                source.get("f_near.weight", &[width, half], Start::Orthogonal(RELU_GAIN))?,
-                source.get("f_near.bias", &[half], Start::Constant(0.0))?,
+                params.tensor("f_near.weight", &[width, half], Init::Orthogonal(RELU_GAIN))?,
+                params.tensor("f_near.bias", &[half], Init::Constant(0.0))?,
             ))
         } else {
             None
@@ -146,16 +150,16 @@ impl TeamNet {
             observe,
             team,
             encounters,
-            goal: Layer::build(source, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?,
-            fuse_norm: if config.feature_norm { Some(Norm::build(source, "f_state.norm", fused)?) } else { None },
-            state: Layer::build(source, "f_state", (fused, f), relu, RELU_GAIN)?,
-            gates: Layer::build(source, "gru.input", (f, 3 * f), Activation::Identity, 1.0)?,
+            goal: Layer::build(params, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?.on_features(),
+            fuse_norm: if config.feature_norm { Some(Norm::build(params, "f_state.norm", fused)?) } else { None },
+            state: Layer::build(params, "f_state", (fused, f), relu, RELU_GAIN)?,
+            gates: Layer::build(params, "gru.input", (f, 3 * f), Activation::Identity, 1.0)?,
             recurrent: (
-                source.get("gru.weight", &[f, 3 * f], Start::Orthogonal(1.0))?,
-                source.get("gru.bias", &[3 * f], Start::Constant(0.0))?,
+                params.tensor("gru.weight", &[f, 3 * f], Init::Orthogonal(1.0))?,
+                params.tensor("gru.bias", &[3 * f], Init::Constant(0.0))?,
             ),
-            out_norm: Norm::build(source, "gru.norm", f)?,
-            head: Layer::build(source, "head", (f, outputs), Activation::Identity, head_gain)?,
+            out_norm: Norm::build(params, "gru.norm", f)?,
+            head: Layer::build(params, "head", (f, outputs), Activation::Identity, head_gain)?,
             spec: *spec,
             width: f,
             pair_hidden: p,
@@ -166,7 +170,7 @@ impl TeamNet {
     fn team_features(&self, input: &Input<'_>) -> CandleResult<Tensor> {
         let features = input.features;
         let n = input.agents;
-        let x = self.observe.forward_constant(&constant(&features.nodes, self.spec.node_width())?)?;
+        let x = self.observe.forward(&constant(features.nodes.as_slice(), self.spec.node_width())?)?;
         match &self.team {
             Team::Graph { encode, blocks, literal } => {
                 let others = mean_of_others(&x, n)?;
@@ -177,12 +181,12 @@ impl TeamNet {
                 } else {
                     encode.forward(&Tensor::cat(&[&x, &others], 1)?)?
                 };
-                let pairs = constant(&features.pairs, 2 * self.spec.dims)?;
+                let pairs = constant(features.pairs.as_slice(), 2 * self.spec.dims)?;
                 let zeros = Tensor::zeros(self.pair_hidden, DType::F32, &Device::Cpu)?;
                 for block in blocks {
                     let projected = block.project.forward(&h)?;
                     let relative = match &block.relative {
-                        Some(w) => crate::ops::linear(&pairs, w, &zeros, Activation::Identity, true)?,
+                        Some(w) => linear(&pairs, w, &zeros, Activation::Identity, true)?,
                         None => Tensor::zeros((pairs.dim(0)?, self.pair_hidden), DType::F32, &Device::Cpu)?,
                     };
                     let shape = GraphBlock { agents: n, ..block.shape.clone() };
@@ -200,7 +204,7 @@ impl TeamNet {
                 let (q, k, v) = (part(0)?, part(1)?, part(2)?);
                 let scale = 1.0 / (HEAD_WIDTH as f64).sqrt();
                 let weights = (q.matmul(&k.transpose(2, 3)?.contiguous()?)? * scale)?;
-                let mixed = candle_nn::ops::softmax(&weights, D::Minus1)?.matmul(&v)?;
+                let mixed = softmax(&weights)?.matmul(&v)?;
                 out.forward(&mixed.transpose(1, 2)?.contiguous()?.reshape((states * n, inner))?)
             }
             Team::Concat { mix } => {
@@ -219,7 +223,7 @@ impl Network for TeamNet {
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
         let sequences = input.sequences * input.agents;
         let team = self.team_features(input)?;
-        let goal = self.goal.forward_constant(&constant(&input.features.goals, self.spec.goal_width())?)?;
+        let goal = self.goal.forward(&constant(input.features.goals.as_slice(), self.spec.goal_width())?)?;
         let mut fused = match &self.encounters {
             None => Tensor::cat(&[&goal, &team], 1)?,
             Some((w, b)) => {
@@ -239,9 +243,5 @@ impl Network for TeamNet {
         let flat = states.reshape((input.steps * sequences, self.width))?;
         let out = self.head.forward(&self.out_norm.forward(&flat)?)?;
         Ok(Output { out, states: Some(states) })
-    }
-
-    fn memory(&self) -> usize {
-        self.width
     }
 }

@@ -39,6 +39,12 @@ impl Symmetry {
         vector
     }
 
+    /// Appends the first `dims` components of a vector as the agent sees it, scaled.
+    #[inline]
+    pub(super) fn put(self, vector: [f32; 3], scale: f32, dims: usize, out: &mut Vec<f32>) {
+        out.extend(self.see(vector)[..dims].iter().map(|x| x * scale));
+    }
+
     /// What an action chosen in this frame is along the axes of the world; in place.
     pub fn act(self, code: ActionCode, action: &mut [u8]) {
         match code {

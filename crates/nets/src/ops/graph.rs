@@ -1,5 +1,5 @@
-use super::{numbers, slice, with_numbers};
-use crate::simd::{LANES, load, sigmoid, store, sum};
+use super::simd::{LANES, load, sigmoid, store, sum};
+use super::{slice, values, with_values};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use std::sync::Arc;
 use wide::f32x16;
@@ -90,7 +90,7 @@ impl Op {
         }
     }
 
-    /// Logits plus noise of agent i towards everybody, sixteen neighbours at a time.
+    /// Logits plus noise of agent i towards all others, sixteen neighbours at a time.
     #[inline(always)]
     fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &mut Scratch) {
         // Several vectors at once hide the latency of the multiply-adds; each lane's sum has the same order either way.
@@ -444,9 +444,9 @@ impl CustomOp3 for Op {
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let dy = dy.contiguous()?;
-        let (relative_numbers, score_numbers) = (numbers(relative)?, numbers(score)?);
-        let gradients = with_numbers(features, |f| {
-            with_numbers(y, |y| with_numbers(&dy, |dy| self.backward(f, &relative_numbers, &score_numbers, y, dy)))
+        let (relative_numbers, score_numbers) = (values(relative)?, values(score)?);
+        let gradients = with_values(features, |f| {
+            with_values(y, |y| with_values(&dy, |dy| self.backward(f, &relative_numbers, &score_numbers, y, dy)))
         })???;
         let device = features.device();
         Ok((

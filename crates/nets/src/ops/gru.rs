@@ -1,6 +1,6 @@
-use super::{numbers, slice, with_numbers};
-use crate::matmul::{Activation, Packed, matmul, weight_gradient};
-use crate::simd::{LANES, load, sigmoid, store, tanh};
+use super::matmul::{Activation, Packed, matmul, weight_gradient};
+use super::simd::{LANES, load, sigmoid, store, tanh};
+use super::{slice, values, with_values};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use std::sync::OnceLock;
 use wide::f32x16;
@@ -85,7 +85,7 @@ impl CustomOp3 for Gru {
         let (steps, rows, triple) = x.dims3()?;
         let hidden = triple / 3;
         let Some(saved) = self.saved.get() else { bail!("gru: gradient without forward") };
-        let transposed = Packed::transposed(&numbers(w)?, hidden, triple);
+        let transposed = Packed::transposed(&values(w)?, hidden, triple);
         let dy = dy.contiguous()?;
         // Gradients of the input projections and of the recurrent projections; they differ in the new gate only.
         let mut dx = vec![0.0; steps * rows * triple];
@@ -94,11 +94,11 @@ impl CustomOp3 for Gru {
         let mut dh = vec![0.0; rows * hidden];
         let mut back = vec![0.0; rows * hidden];
         let size = rows * hidden;
-        with_numbers(states, |states| {
+        with_values(states, |states| {
             previous[..size].copy_from_slice(&self.h0);
             previous[size..].copy_from_slice(&states[..(steps - 1) * size]);
         })?;
-        with_numbers(&dy, |dy| {
+        with_values(&dy, |dy| {
             for t in (0..steps).rev() {
                 for r in 0..rows {
                     let keep = &saved[(t * rows + r) * 4 * hidden..][..4 * hidden];

@@ -1,5 +1,5 @@
-use super::{rows, slice, with_numbers};
-use crate::matmul::{Activation, Packed, matmul, weight_gradient};
+use super::matmul::{Activation, Packed, matmul, weight_gradient};
+use super::{rows, slice, with_values};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
 /// y [.., n] = act(x [.., k] · w [k, n] + b `[n]`). With `constant_input` no gradient is computed for x: candle would
@@ -51,13 +51,13 @@ impl CustomOp3 for Linear {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let (k, n) = w.dims2()?;
         let dy = dy.contiguous()?;
-        let dz = with_numbers(y, |y| with_numbers(&dy, |dy| self.act.backward(y, dy)))??;
-        let (dw, db) = with_numbers(x, |x| weight_gradient(x, &dz, k, n))?;
+        let dz = with_values(y, |y| with_values(&dy, |dy| self.act.backward(y, dy)))??;
+        let (dw, db) = with_values(x, |x| weight_gradient(x, &dz, k, n))?;
         let dx = if self.constant_input {
             None
         } else {
             let mut dx = vec![0.0; x.elem_count()];
-            let packed = with_numbers(w, |w| Packed::transposed(w, k, n))?;
+            let packed = with_values(w, |w| Packed::transposed(w, k, n))?;
             matmul(&dz, &packed, None, Activation::Identity, &mut dx);
             Some(Tensor::from_vec(dx, x.shape(), x.device())?)
         };

@@ -1,5 +1,5 @@
-use super::{rows, slice, with_numbers};
-use crate::simd::{LANES, load, store, sum};
+use super::simd::{LANES, load, store, sum};
+use super::{rows, slice, with_values};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use wide::f32x16;
 
@@ -85,8 +85,8 @@ impl CustomOp3 for LayerNorm {
         let n = scale.elem_count();
         let dy = dy.contiguous()?;
         let gains = scale.to_vec1::<f32>()?;
-        let (dx, ds, db) = with_numbers(x, |x| {
-            with_numbers(&dy, |dy| {
+        let (dx, ds, db) = with_values(x, |x| {
+            with_values(&dy, |dy| {
                 let mut dx = vec![0.0; x.len()];
                 let vectors = n.div_ceil(LANES);
                 let (mut ds, mut db) = (vec![f32x16::ZERO; vectors], vec![f32x16::ZERO; vectors]);

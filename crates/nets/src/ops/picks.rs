@@ -1,5 +1,5 @@
-use super::{slice, with_numbers};
-use crate::simd::{LANES, load, store, sum};
+use super::simd::{LANES, load, store, sum};
+use super::{slice, with_values};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use std::sync::Arc;
 use wide::f32x16;
@@ -39,7 +39,7 @@ struct PickLogProbs {
 const FLOOR: f32 = -80.0;
 
 /// Which columns can still be taken: 0 for those, −∞ for the others, to be added to scores.
-pub(crate) type Open = [f32];
+pub(crate) type Mask = [f32];
 
 /// Log-softmax over the free columns of a row. The maximum is taken over the free columns at every pick: with the row's
 /// maximum the sum could underflow late in a ranking.
@@ -51,12 +51,12 @@ pub(crate) struct MaskedSoftmax {
 }
 
 impl MaskedSoftmax {
-    pub(crate) fn of(row: &[f32], open: &Open) -> Self {
+    pub(crate) fn of(row: &[f32], mask: &Mask) -> Self {
         let lowest = f32x16::splat(f32::NEG_INFINITY);
-        let highest = vectors(row, open).fold(lowest, |max, (x, _)| max.fast_max(x)).to_array();
+        let highest = vectors(row, mask).fold(lowest, |max, (x, _)| max.fast_max(x)).to_array();
         let max = highest.into_iter().fold(f32::NEG_INFINITY, |a, b| if b > a { b } else { a });
         let (shift, floor) = (f32x16::splat(max), f32x16::splat(FLOOR));
-        let total = vectors(row, open).fold(f32x16::ZERO, |total, (x, _)| total + (x - shift).fast_max(floor).exp());
+        let total = vectors(row, mask).fold(f32x16::ZERO, |total, (x, _)| total + (x - shift).fast_max(floor).exp());
         Self { max, log_sum: libm::logf(sum(total)) }
     }
 
@@ -66,13 +66,13 @@ impl MaskedSoftmax {
     }
 
     /// Fills the probabilities and log-probabilities (meaningless where a column is taken) and returns the entropy.
-    fn fill(&self, row: &[f32], open: &Open, probs: &mut [f32], log_probs: &mut [f32]) -> f32 {
+    fn fill(&self, row: &[f32], mask: &Mask, probs: &mut [f32], log_probs: &mut [f32]) -> f32 {
         let (shift, log_sum) = (f32x16::splat(self.max), f32x16::splat(self.log_sum));
         let mut entropy = f32x16::ZERO;
         let outs = probs.chunks_mut(LANES).zip(log_probs.chunks_mut(LANES));
-        for ((x, is_open), (probs, log_probs)) in vectors(row, open).zip(outs) {
+        for ((x, is_free), (probs, log_probs)) in vectors(row, mask).zip(outs) {
             let log_prob = ((x - shift) - log_sum).fast_max(f32x16::splat(FLOOR));
-            let prob = log_prob.exp() * is_open;
+            let prob = log_prob.exp() * is_free;
             entropy -= prob * log_prob;
             store(prob, probs);
             store(log_prob, log_probs);
@@ -82,17 +82,17 @@ impl MaskedSoftmax {
 }
 
 /// A row cut into vectors: scores, −∞ where a column is taken or there is none, and 1 or 0 for the same.
-fn vectors<'a>(row: &'a [f32], open: &'a Open) -> impl Iterator<Item = (f32x16, f32x16)> + 'a {
-    row.chunks(LANES).zip(open.chunks(LANES)).map(|(row, open)| {
-        let open = match open.first_chunk::<LANES>() {
-            Some(open) => f32x16::new(*open),
+fn vectors<'a>(row: &'a [f32], mask: &'a Mask) -> impl Iterator<Item = (f32x16, f32x16)> + 'a {
+    row.chunks(LANES).zip(mask.chunks(LANES)).map(|(row, mask)| {
+        let mask = match mask.first_chunk::<LANES>() {
+            Some(mask) => f32x16::new(*mask),
             None => {
                 let mut lanes = [f32::NEG_INFINITY; LANES];
-                lanes[..open.len()].copy_from_slice(open);
+                lanes[..mask.len()].copy_from_slice(mask);
                 f32x16::new(lanes)
             }
         };
-        (load(row) + open, (open + f32x16::ONE).fast_max(f32x16::ZERO))
+        (load(row) + mask, (mask + f32x16::ONE).fast_max(f32x16::ZERO))
     })
 }
 
@@ -107,19 +107,19 @@ impl CustomOp1 for PickLogProbs {
         let mut out = vec![0.0; 2 * count];
         let mut at = 0;
         for table in self.tables.iter() {
-            let mut open = vec![0.0; table.columns];
+            let mut mask = vec![0.0; table.columns];
             let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
             for pick in &table.picks {
                 let start = table.start + pick.row as usize * table.columns;
                 let column = pick.column as usize;
-                if start + table.columns > scores.len() || open.get(column).is_none_or(|open| *open < 0.0) {
+                if start + table.columns > scores.len() || mask.get(column).is_none_or(|mask| *mask < 0.0) {
                     bail!("picks: row {} column {column} does not exist or is taken", pick.row);
                 }
                 let row = &scores[start..start + table.columns];
-                let softmax = MaskedSoftmax::of(row, &open);
+                let softmax = MaskedSoftmax::of(row, &mask);
                 out[at] = softmax.log_prob(row[column]);
-                out[count + at] = softmax.fill(row, &open, &mut probs, &mut log_probs);
-                open[column] = f32::NEG_INFINITY;
+                out[count + at] = softmax.fill(row, &mask, &mut probs, &mut log_probs);
+                mask[column] = f32::NEG_INFINITY;
                 at += 1;
             }
         }
@@ -129,23 +129,23 @@ impl CustomOp1 for PickLogProbs {
     fn bwd(&self, scores: &Tensor, out: &Tensor, upstream: &Tensor) -> Result<Option<Tensor>> {
         let (_, count) = out.dims2()?;
         let upstream = upstream.contiguous()?.flatten_all()?.to_vec1::<f32>()?;
-        let gradient = with_numbers(scores, |scores| {
+        let gradient = with_values(scores, |scores| {
             let mut gradient = vec![0.0; scores.len()];
             let mut at = 0;
             for table in self.tables.iter() {
-                let mut open = vec![0.0; table.columns];
+                let mut mask = vec![0.0; table.columns];
                 let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
                 for pick in &table.picks {
                     let start = table.start + pick.row as usize * table.columns;
                     let row = start..start + table.columns;
                     let scores = &scores[row.clone()];
-                    let entropy = MaskedSoftmax::of(scores, &open).fill(scores, &open, &mut probs, &mut log_probs);
+                    let entropy = MaskedSoftmax::of(scores, &mask).fill(scores, &mask, &mut probs, &mut log_probs);
                     let (d_log_prob, d_entropy) = (upstream[at], upstream[count + at]);
                     for ((g, &p), &log_prob) in gradient[row].iter_mut().zip(&probs).zip(&log_probs) {
                         *g -= p * (d_log_prob + d_entropy * (log_prob + entropy));
                     }
                     gradient[start + pick.column as usize] += d_log_prob;
-                    open[pick.column as usize] = f32::NEG_INFINITY;
+                    mask[pick.column as usize] = f32::NEG_INFINITY;
                     at += 1;
                 }
             }

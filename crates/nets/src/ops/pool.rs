@@ -1,5 +1,5 @@
-use super::{slice, with_numbers};
-use crate::simd::{LANES, load, store};
+use super::simd::{LANES, load, store};
+use super::{slice, with_values};
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use wide::f32x16;
 
@@ -51,7 +51,7 @@ impl CustomOp1 for MeanOfOthers {
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let (_, width) = x.dims2()?;
-        let dx = with_numbers(&dy.contiguous()?, |dy| self.run(dy, width))?;
+        let dx = with_values(&dy.contiguous()?, |dy| self.run(dy, width))?;
         Ok(Some(Tensor::from_vec(dx, x.shape(), x.device())?))
     }
 }
@@ -63,7 +63,7 @@ pub fn neighbour_pool(features: &Tensor, counts: std::sync::Arc<Vec<u8>>, w: &Te
     if counts.len() != rows {
         bail!("neighbour pool: {} counts for {rows} rows", counts.len());
     }
-    let features = with_numbers(&features.contiguous()?, |f| f.to_vec())?;
+    let features = with_values(&features.contiguous()?, |f| f.to_vec())?;
     w.apply_op2(b, NeighbourPool { features, counts, neighbours, channels })
 }
 
@@ -111,8 +111,7 @@ impl CustomOp2 for NeighbourPool {
     fn bwd(&self, w: &Tensor, b: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (channels, width) = w.dims2()?;
         let dy = dy.contiguous()?;
-        let (dw, db) =
-            with_numbers(w, |w| with_numbers(b, |b| with_numbers(&dy, |dy| self.gradient(w, b, dy, width))))???;
+        let (dw, db) = with_values(w, |w| with_values(b, |b| with_values(&dy, |dy| self.gradient(w, b, dy, width))))???;
         Ok((Some(Tensor::from_vec(dw, (channels, width), w.device())?), Some(Tensor::from_vec(db, width, w.device())?)))
     }
 }

@@ -1,8 +1,9 @@
 //! Imitation of the exact solver: the scheduler learns to give the exact assignment's picks a high probability, before PPO
 //! goes on from there.
 
-use super::{CommanderError, CommanderPpo, CommanderState};
-use candle_core::{Device, Tensor, Var};
+use super::{CommanderError, CommanderPpo};
+use crate::train::batch::column;
+use crate::train::learned::Network;
 use magex_nets::commander::{Commander, Instance, Team};
 use magex_nets::ops::Pick;
 
@@ -37,21 +38,18 @@ impl CommanderPpo {
     /// Lessons of another scheduler, and what the tensor library refuses.
     pub fn imitate(
         &self,
-        state: &mut CommanderState,
+        network: &mut Network,
         lessons: &[Lesson],
         progress_rate: f64,
     ) -> Result<f64, CommanderError> {
-        let variables = state.params.variables()?;
-        let tensors = variables.iter().map(|v: &Var| v.as_tensor().clone()).collect();
-        let commander = Commander::build(&self.config, self.agents, self.dims, &mut state.params.source(tensors))?;
+        let (commander, variables) = self.differentiable(network)?;
         let instances: Vec<Instance> = lessons.iter().map(|lesson| lesson.instance.clone()).collect();
         let picks: Vec<Vec<Pick>> = lessons.iter().map(|lesson| lesson.picks.clone()).collect();
         let log_probs = commander.pick_log_probs(&instances, &picks)?.get(0)?;
         let share = |picks: &Vec<Pick>| std::iter::repeat_n(1.0 / (picks.len() * lessons.len()) as f32, picks.len());
         let weights: Vec<f32> = picks.iter().flat_map(share).collect();
-        let weights = Tensor::from_vec(weights, log_probs.elem_count(), &Device::Cpu)?;
-        let loss = (log_probs * weights)?.sum_all()?.neg()?;
-        self.descend(state, &variables, &loss, progress_rate)?;
+        let loss = (log_probs * column(weights)?)?.sum_all()?.neg()?;
+        self.descend(network, &variables, &loss, progress_rate)?;
         Ok(f64::from(loss.to_scalar::<f32>()?))
     }
 }

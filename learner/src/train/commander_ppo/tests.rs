@@ -17,12 +17,8 @@ fn ppo() -> CommanderPpo {
     CommanderPpo::new(&config, &TaskConfig::simple_spread(20, Spawn::Uniform), 1)
 }
 
-fn built(ppo: &CommanderPpo, params: &Params) -> Commander {
-    Commander::build(&ppo.config, ppo.agents, ppo.dims, &mut params.source(params.plain().unwrap())).unwrap()
-}
-
 fn lessons(ppo: &CommanderPpo, sizes: &[(usize, usize)]) -> Vec<Lesson> {
-    let commander = built(ppo, &ppo.start().unwrap().params);
+    let commander = ppo.commander(&ppo.init().unwrap()).unwrap();
     let lesson = |(k, &(n, g)): (usize, &(usize, usize))| {
         let (agents, goals) = points(n, g, k as u32);
         let team = Team { agents: &agents, goals: &goals, dims: 2 };
@@ -34,8 +30,8 @@ fn lessons(ppo: &CommanderPpo, sizes: &[(usize, usize)]) -> Vec<Lesson> {
 }
 
 /// Mean log-probability of the lessons' picks.
-fn mean_log_prob(ppo: &CommanderPpo, params: &Params, lessons: &[Lesson]) -> f64 {
-    let commander = built(ppo, params);
+fn mean_log_prob(ppo: &CommanderPpo, network: &Network, lessons: &[Lesson]) -> f64 {
+    let commander = ppo.commander(network).unwrap();
     let of = |lesson: &Lesson| {
         let both = commander
             .pick_log_probs(std::slice::from_ref(&lesson.instance), std::slice::from_ref(&lesson.picks))
@@ -48,7 +44,7 @@ fn mean_log_prob(ppo: &CommanderPpo, params: &Params, lessons: &[Lesson]) -> f64
 #[test]
 fn a_sampled_decision_has_the_same_likelihood_when_it_is_looked_at_again() {
     let ppo = ppo();
-    let commander = built(&ppo, &ppo.start().unwrap().params);
+    let commander = ppo.commander(&ppo.init().unwrap()).unwrap();
     for (n, g) in [(1, 1), (2, 2), (7, 7), (50, 50), (5, 40), (40, 5), (17, 16), (1, 9), (9, 1)] {
         let (agents, goals) = points(n, g, 0);
         let team = Team { agents: &agents, goals: &goals, dims: 2 };
@@ -78,7 +74,7 @@ fn agents_without_a_goal_cost_nothing() {
 #[test]
 fn goals_that_occur_twice_have_no_picks() {
     let ppo = ppo();
-    let commander = built(&ppo, &ppo.start().unwrap().params);
+    let commander = ppo.commander(&ppo.init().unwrap()).unwrap();
     let (agents, goals) = points(4, 4, 0);
     let instance = commander.instance(&Team { agents: &agents, goals: &goals, dims: 2 }).unwrap();
     assert!(instance.picks_of(&[0, 1, 2, 3]).is_some());
@@ -91,29 +87,27 @@ fn goals_that_occur_twice_have_no_picks() {
 fn the_gradient_of_the_cross_entropy_is_its_slope() {
     let ppo = ppo();
     let lessons = lessons(&ppo, &[(6, 6), (5, 12), (20, 20)]);
-    let mut params = ppo.start().unwrap().params;
+    let mut network = ppo.init().unwrap();
     // Far enough from the start for every layer to matter.
     let mut stream = Key::new(9, Purpose::Init, &[]).stream();
-    params.numbers.iter_mut().for_each(|x| *x += 0.1 * stream.normal() as f32);
-    let variables = params.variables().unwrap();
-    let tensors = variables.iter().map(|v| v.as_tensor().clone()).collect();
-    let commander = Commander::build(&ppo.config, 20, 2, &mut params.source(tensors)).unwrap();
+    network.params.values.iter_mut().for_each(|x| *x += 0.1 * stream.normal() as f32);
+    let (commander, variables) = ppo.differentiable(&network).unwrap();
     let instances: Vec<Instance> = lessons.iter().map(|l| l.instance.clone()).collect();
     let picks: Vec<Vec<Pick>> = lessons.iter().map(|l| l.picks.clone()).collect();
     let both = commander.pick_log_probs(&instances, &picks).unwrap();
     let value =
         |both: &Tensor| both.get(0).unwrap().sum_all().unwrap() + (both.get(1).unwrap().sum_all().unwrap() * 0.3);
     let gradients = value(&both).unwrap().backward().unwrap();
-    let number = |params: &Params| {
-        let both = built(&ppo, params).pick_log_probs(&instances, &picks).unwrap();
+    let number = |network: &Network| {
+        let both = ppo.commander(network).unwrap().pick_log_probs(&instances, &picks).unwrap();
         f64::from(value(&both).unwrap().to_scalar::<f32>().unwrap())
     };
-    for (entry, variable) in params.entries.clone().iter().zip(&variables) {
+    for (entry, variable) in network.params.entries.clone().iter().zip(&variables) {
         let gradient = gradients.get(variable).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
         let place = (0..gradient.len()).max_by(|&a, &b| gradient[a].abs().total_cmp(&gradient[b].abs())).unwrap();
         let slope = |step: f32| {
-            let mut moved = params.clone();
-            moved.numbers[entry.start + place] += step;
+            let mut moved = network.clone();
+            moved.params.values[entry.start + place] += step;
             number(&moved)
         };
         let slope = (slope(2e-3) - slope(-2e-3)) / 4e-3;
@@ -127,11 +121,11 @@ fn imitation_makes_the_exact_assignment_likelier_also_on_teams_of_another_size()
     let ppo = ppo();
     let sizes: Vec<(usize, usize)> = (0..48).map(|k| (2 + k, 2 + k + k % 3)).collect();
     let (seen, unseen) = (lessons(&ppo, &sizes), lessons(&ppo, &[(200, 200), (199, 200), (3, 3)]));
-    let mut state = ppo.start().unwrap();
-    let before = mean_log_prob(&ppo, &state.params, &unseen);
-    let first = ppo.imitate(&mut state, &seen, 1.0).unwrap();
-    let losses: Vec<f64> = (0..40).map(|_| ppo.imitate(&mut state, &seen, 1.0).unwrap()).collect();
-    let (last, after) = (losses[39], mean_log_prob(&ppo, &state.params, &unseen));
+    let mut network = ppo.init().unwrap();
+    let before = mean_log_prob(&ppo, &network, &unseen);
+    let first = ppo.imitate(&mut network, &seen, 1.0).unwrap();
+    let losses: Vec<f64> = (0..40).map(|_| ppo.imitate(&mut network, &seen, 1.0).unwrap()).collect();
+    let (last, after) = (losses[39], mean_log_prob(&ppo, &network, &unseen));
     assert!(last < 0.9 * first, "{first} became {last}");
     assert!(after > 0.9 * before, "{before} became {after}");
 }

@@ -162,7 +162,7 @@ fn weights(args: &AssignArgs, place: &Path) -> anyhow::Result<(Vec<u8>, RunConfi
     }
     let mut config = RunConfig::default();
     config.commander = CommanderConfig { kind: CommanderKind::Pairwise, ..config.commander };
-    let params = Commander::start(&config.commander, config.task.agents, 2, config.run.seed)?;
+    let params = Commander::init(&config.commander, config.task.agents, 2, config.run.seed)?;
     let bytes = to_safetensors(&[("commander", &params)], "{\"format\":1}")?;
     std::fs::create_dir_all(place)?;
     Ok((bytes, config, "pairwise, untrained; name a trained one with --run".to_owned()))

@@ -12,7 +12,7 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_env::spawn::{Start, spawn};
-use magex_learner::train::commander_ppo::{CommanderPpo, CommanderState, Sample, cost, greedy_cost};
+use magex_learner::train::commander_ppo::{CommanderPpo, Sample, cost, greedy_cost};
 use magex_nets::commander::{Commander, Team};
 use serde_json::json;
 use std::path::PathBuf;
@@ -94,8 +94,7 @@ pub(super) fn commander(args: &CommanderArgs) -> anyhow::Result<Report> {
     let mut report = Report::new("commander", title, 1, &heading);
     let config = RunConfig::default();
     let pairwise = CommanderConfig { kind: CommanderKind::Pairwise, ..config.commander.clone() };
-    let fresh = Commander::start(&pairwise, 50, 2, config.run.seed)?;
-    let untrained = Commander::build(&pairwise, 50, 2, &mut fresh.source(fresh.plain()?))?;
+    let untrained = Commander::of(&pairwise, 50, 2, &Commander::init(&pairwise, 50, 2, config.run.seed)?)?;
     let mut commanders = vec![("pairwise, untrained".to_owned(), untrained, None)];
     if let Some(run) = &args.run {
         let trained = folder::load(run, None)?;
@@ -209,22 +208,19 @@ pub(super) fn ranking(args: &RankingArgs) -> anyhow::Result<Report> {
             ..CommanderConfig::default()
         };
         let ppo = CommanderPpo::new(&config, &task, args.seed);
-        let build = |state: &CommanderState| {
-            Commander::build(&config, args.agents, 2, &mut state.params.source(state.params.plain()?))
-        };
-        let mut state = ppo.start()?;
-        let [untrained, ..] = ratios(&task, args.instances, greedy_of(&build(&state)?))?;
+        let mut network = ppo.init()?;
+        let [untrained, ..] = ratios(&task, args.instances, greedy_of(&ppo.commander(&network)?))?;
         let [chance, ..] = ratios(&task, args.instances, |_, k| {
             Ok(random(args.agents, args.agents, &mut Key::new(args.seed, Purpose::Bench, &[5, k]).stream())?)
         })?;
         let clock = Instant::now();
         for iteration in 0..args.iterations {
-            let samples = decisions(args, &task, &build(&state)?, iteration)?;
+            let samples = decisions(args, &task, &ppo.commander(&network)?, iteration)?;
             let rate = 1.0 - f64::from(iteration) / f64::from(args.iterations);
-            ppo.improve(&mut state, &samples, iteration, rate)?;
+            ppo.improve(&mut network, &samples, iteration, rate)?;
         }
         let seconds = clock.elapsed().as_secs_f64();
-        let [trained, worst, _] = ratios(&task, args.instances, greedy_of(&build(&state)?))?;
+        let [trained, worst, _] = ratios(&task, args.instances, greedy_of(&ppo.commander(&network)?))?;
         note(format!("{spawn}: {trained:.4} (random {chance:.4})"));
         let numbers = [trained, worst, untrained, chance].map(|x| format!("{x:.4}"));
         let cells = [spawn.to_string()].into_iter().chain(numbers).chain([format!("{seconds:.0}")]).collect();

@@ -4,7 +4,7 @@
 //! which sees thousands of rows, gets the same bits as an actor, which sees a few hundred: the first importance ratio
 //! is exactly 1. The general-purpose `gemm` crate gives no such promise.
 
-use crate::simd::{LANES, load, store};
+use super::simd::{LANES, load, store};
 use wide::f32x16;
 
 /// What is applied to a layer's output.
@@ -24,7 +24,7 @@ impl Activation {
         match self {
             Self::Identity => x,
             Self::Relu => x.fast_max(f32x16::ZERO),
-            Self::Tanh => crate::simd::tanh(x),
+            Self::Tanh => super::simd::tanh(x),
         }
     }
 

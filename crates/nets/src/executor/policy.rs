@@ -1,0 +1,65 @@
+//! What a policy does: act in a rollout, and evaluate given actions in the update.
+
+use super::{Input, Network};
+use crate::distribution::ActionHeads;
+use crate::ops::{action_log_probs, with_values};
+use candle_core::{Result, Tensor};
+
+/// Chooses actions: from a random stream, or the most likely one. It keeps what it chose.
+pub trait Chooser {
+    /// Chooses the action of one row of the batch, `[H]`, given its logits `[A]`. Every row is asked for once.
+    fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8];
+}
+
+/// What acting leaves behind beside the actions, which the [`Chooser`] has.
+#[derive(Debug)]
+pub struct Acted {
+    /// [L, C·N, H] states of the memory after each step; `None` for networks without memory.
+    pub states: Option<Tensor>,
+}
+
+/// What a policy thinks of given actions, differentiable in its parameters.
+#[derive(Debug)]
+pub struct Evaluated {
+    /// `[R]` log-probability of each agent's action.
+    pub log_probs: Tensor,
+    /// `[R]` entropy of each agent's distribution, in nats.
+    pub entropies: Tensor,
+    /// [L, C·N, H] states of the memory after each step; `None` for networks without memory.
+    pub states: Option<Tensor>,
+}
+
+/// A policy of all agents. A row may depend on the actions of other rows of its joint state (decoding agent by agent):
+/// `act` shows the logits of a row to the chooser before it computes those of the next one, `evaluate` is given all actions.
+/// Both give the same log-probabilities for the same actions, to the bit: the first importance ratio is exactly 1.
+pub trait Policy: Send + Sync {
+    /// Chooses an action for every row of the batch.
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted>;
+
+    /// Evaluates the actions [R, H] of every row of the batch.
+    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated>;
+}
+
+/// Agents act independently of each other, given what they see: one network computes the logits of all rows at once.
+pub struct Independent {
+    pub(super) network: Box<dyn Network>,
+    pub(super) heads: ActionHeads,
+}
+
+impl Policy for Independent {
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted> {
+        let output = self.network.forward(input)?;
+        with_values(&output.out, |logits| {
+            for (row, logits) in logits.chunks_exact(self.heads.logits()).enumerate() {
+                choose.choose(row, logits);
+            }
+        })?;
+        Ok(Acted { states: output.states })
+    }
+
+    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
+        let output = self.network.forward(input)?;
+        let both = action_log_probs(&output.out, actions.to_vec(), &self.heads)?;
+        Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: output.states })
+    }
+}

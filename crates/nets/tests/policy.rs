@@ -1,0 +1,186 @@
+//! The seam between policies, rollouts and updates, seen by a policy that decodes agent by agent.
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
+use candle_core::{Result, Tensor, Var};
+use magex_core::config::RunConfig;
+use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::task::{Spawn, TaskConfig};
+use magex_nets::distribution::ActionHeads;
+use magex_nets::executor::{Acted, Chooser, Evaluated, Input, Model, Policy};
+use magex_nets::features::{Features, JointStates};
+use magex_nets::ops::{self, Activation, GraphNoise};
+use magex_nets::params::{ParamBuilder, Params, to_safetensors};
+
+/// Logits of agent i = features_i · w + Σ over agents before it of v[action]: the smallest policy whose agents see what the
+/// agents before them do.
+struct Decoder {
+    w: Tensor,
+    v: Tensor,
+    heads: ActionHeads,
+}
+
+impl Decoder {
+    fn new(w: Tensor, v: Tensor) -> Self {
+        Self { w, v, heads: ActionHeads::new(vec![5]).unwrap() }
+    }
+
+    /// Logits [S·N, A] given the actions of the agents before each agent.
+    fn logits(&self, input: &Input<'_>, actions: &[u8]) -> Result<Tensor> {
+        let mut before = vec![0.0; actions.len() * 5];
+        for (state, actions) in actions.chunks_exact(input.agents).enumerate() {
+            for (i, &action) in actions.iter().enumerate() {
+                for later in i + 1..input.agents {
+                    before[(state * input.agents + later) * 5 + usize::from(action)] += 1.0;
+                }
+            }
+        }
+        let zeros = Tensor::zeros_like(&self.v.get(0)?)?;
+        let width = input.features.goals.len() / actions.len();
+        let own =
+            ops::linear(&ops::constant(input.features.goals.as_slice(), width)?, &self.w, &zeros, IDENTITY, true)?;
+        own + ops::linear(&ops::constant(before, 5)?, &self.v, &zeros, IDENTITY, true)?
+    }
+}
+
+const IDENTITY: Activation = Activation::Identity;
+
+impl Policy for Decoder {
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted> {
+        let rows = input.steps * input.sequences * input.agents;
+        let mut actions = vec![0; rows];
+        for agent in 0..input.agents {
+            let logits = self.logits(input, &actions)?.to_vec2::<f32>()?;
+            for row in (agent..rows).step_by(input.agents) {
+                actions[row] = choose.choose(row, &logits[row])[0];
+            }
+        }
+        Ok(Acted { states: None })
+    }
+
+    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
+        let both = ops::action_log_probs(&self.logits(input, actions)?, actions.to_vec(), &self.heads)?;
+        Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: None })
+    }
+}
+
+/// Samples from one stream per joint state; the first agents may be made to do something else.
+struct Sampler {
+    heads: ActionHeads,
+    streams: Vec<Stream>,
+    agents: usize,
+    forced: Option<u8>,
+    actions: Vec<u8>,
+    log_probs: Vec<f32>,
+}
+
+impl Sampler {
+    fn new(heads: &ActionHeads, states: usize, agents: usize, forced: Option<u8>) -> Self {
+        let stream = |s: usize| Key::new(1, Purpose::Action, &[s as u32]).stream();
+        let rows = states * agents;
+        Self {
+            heads: heads.clone(),
+            streams: (0..states).map(stream).collect(),
+            agents,
+            forced,
+            actions: vec![0; rows * heads.count()],
+            log_probs: vec![0.0; rows],
+        }
+    }
+}
+
+impl Chooser for Sampler {
+    fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8] {
+        let action = &mut self.actions[row * self.heads.count()..(row + 1) * self.heads.count()];
+        self.log_probs[row] = self.heads.choose(logits, Some(&mut self.streams[row / self.agents]), action);
+        if let Some(forced) = self.forced.filter(|_| row.is_multiple_of(self.agents)) {
+            action.fill(forced);
+        }
+        action
+    }
+}
+
+fn normal(n: usize, tag: u32) -> Vec<f32> {
+    let mut s = Key::new(11, Purpose::Bench, &[tag]).stream();
+    (0..n).map(|_| s.normal() as f32).collect()
+}
+
+const AGENTS: usize = 4;
+const STATES: usize = 6;
+
+fn features(model: &Model, task: &TaskConfig) -> Features {
+    let s = task.shape(STATES);
+    model.spec().compute(&JointStates {
+        positions: &normal(STATES * s.bodies * s.dims, 1),
+        velocities: &normal(STATES * s.bodies * s.dims, 2),
+        agent_state: &[],
+        landmarks: &normal(STATES * s.landmarks * s.dims, 3),
+        goals: &(0..STATES).flat_map(|_| 0..AGENTS as u32).collect::<Vec<_>>(),
+    })
+}
+
+fn input<'a>(features: &'a Features, memory: usize) -> Input<'a> {
+    let hidden = vec![0.1; STATES * AGENTS * memory];
+    Input { steps: 1, sequences: STATES, agents: AGENTS, features, hidden, noise: GraphNoise::Off }
+}
+
+fn config() -> RunConfig {
+    RunConfig { task: TaskConfig::simple_spread(AGENTS, Spawn::Uniform), ..RunConfig::default() }
+}
+
+#[test]
+fn earlier_actions_of_a_decoder_reach_later_agents_and_evaluation_agrees_with_acting() {
+    let config = config();
+    let model = Model::new(&config).unwrap();
+    let features = features(&model, &config.task);
+    let width = model.spec().goal_width();
+    let var = |rows: usize, tag| Var::from_tensor(&ops::constant(normal(rows * 5, tag), 5).unwrap()).unwrap();
+    let (w, v) = (var(width, 4), var(5, 5));
+    let decoder = Decoder::new(w.as_tensor().clone(), v.as_tensor().clone());
+    let act = |forced| {
+        let mut sampler = Sampler::new(&decoder.heads, STATES, AGENTS, forced);
+        decoder.act(&input(&features, 0), &mut sampler).unwrap();
+        sampler
+    };
+    let free = act(None);
+    let evaluated = decoder.evaluate(&input(&features, 0), &free.actions).unwrap();
+    assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), free.log_probs);
+    // The same streams, another first agent: the others have other probabilities.
+    let other = act(Some(4));
+    for state in 0..STATES {
+        let (first, last) = (state * AGENTS, (state + 1) * AGENTS - 1);
+        assert_eq!(free.log_probs[first], other.log_probs[first]);
+        assert_eq!(free.log_probs[last] == other.log_probs[last], free.actions[first] == 4, "state {state}");
+    }
+    // The update differentiates through what the agents before did.
+    let gradients = evaluated.log_probs.sum_all().unwrap().backward().unwrap();
+    for variable in [&w, &v] {
+        let size = gradients.get(variable).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!(size > 0.0 && size.is_finite());
+    }
+}
+
+#[test]
+fn a_loaded_policy_acts_as_the_one_that_was_written_and_evaluation_agrees_with_acting() {
+    let config = config();
+    let model = Model::new(&config).unwrap();
+    let features = features(&model, &config.task);
+    let stream = |k: u32| Key::new(2, Purpose::Init, &[k]).stream();
+    let params: Vec<Params> =
+        model.layouts().unwrap().into_iter().zip(0..).map(|(layout, k)| Params::init(layout, stream(k))).collect();
+    let builder = |params: &Params| ParamBuilder::with(params.tensors().unwrap());
+    let own = model.policy(&mut params.iter().map(builder).collect::<Vec<_>>()).unwrap();
+    // Actors are sent what the policy reads, and nothing else.
+    let published = model.parts().iter().zip(&params).filter(|(part, _)| part.policy);
+    let published: Vec<(&str, &Params)> = published.map(|(part, params)| (part.name, params)).collect();
+    let loaded = model.load_policy(&to_safetensors(&published, "").unwrap()).unwrap();
+    let act = |policy: &dyn Policy| {
+        let mut sampler = Sampler::new(model.heads(), STATES, AGENTS, None);
+        let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap().states.unwrap();
+        (sampler.actions, sampler.log_probs, states.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+    };
+    let (actions, log_probs, states) = act(own.as_ref());
+    assert_eq!(act(loaded.as_ref()), (actions.clone(), log_probs.clone(), states.clone()));
+    let evaluated = own.evaluate(&input(&features, model.memory()), &actions).unwrap();
+    assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), log_probs);
+    assert_eq!(evaluated.states.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap(), states);
+}

@@ -1,0 +1,66 @@
+//! What learning changes: named networks with their optimisers, and the statistics of the value targets.
+
+use crate::train::adam::Adam;
+use crate::train::commander_ppo::CommanderPpo;
+use crate::train::gae::ValueNorm;
+use crate::train::mappo::Mappo;
+use magex_nets::params::{ParamError, Params, to_safetensors};
+
+/// One set of parameters with its optimiser.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Network {
+    /// Its name in weights files and checkpoints.
+    pub name: String,
+    /// The parameters; none for a scheduler that is not learned.
+    pub params: Params,
+    /// Moments of their gradient.
+    pub adam: Adam,
+    /// Whether actors and commanders need it.
+    pub published: bool,
+}
+
+impl Network {
+    /// With an optimiser that has done no step.
+    pub fn new(name: &str, params: Params, published: bool) -> Self {
+        Self { name: name.to_owned(), adam: Adam::new(params.values.len()), params, published }
+    }
+}
+
+/// Everything that learning changes. A checkpoint holds exactly this: an algorithm with other networks adds them to the list.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Learned {
+    /// The executor's networks in the order of [`magex_nets::executor::Model::parts`], then the commander's.
+    pub networks: Vec<Network>,
+    /// Running statistics of returns.
+    pub value_norm: ValueNorm,
+}
+
+impl Learned {
+    /// Initial networks and optimisers.
+    pub fn init(mappo: &Mappo, commander: &CommanderPpo) -> Result<Self, ParamError> {
+        let mut networks = mappo.init()?;
+        networks.push(commander.init()?);
+        Ok(Self { networks, value_norm: mappo.value_norm() })
+    }
+
+    /// The network of a name.
+    pub fn network(&self, name: &str) -> Option<&Network> {
+        self.networks.iter().find(|network| network.name == name)
+    }
+
+    /// The weights file: all networks. Its SHA-256 is the identity of what was learned.
+    pub fn weights(&self) -> Result<Vec<u8>, ParamError> {
+        self.file(|_| true)
+    }
+
+    /// What actors and commanders need.
+    pub fn broadcast(&self) -> Result<Vec<u8>, ParamError> {
+        self.file(|network| network.published)
+    }
+
+    fn file(&self, which: fn(&Network) -> bool) -> Result<Vec<u8>, ParamError> {
+        let networks = self.networks.iter().filter(|network| which(network));
+        let named: Vec<(&str, &Params)> = networks.map(|network| (network.name.as_str(), &network.params)).collect();
+        to_safetensors(&named, "{\"format\":1}")
+    }
+}
