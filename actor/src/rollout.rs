@@ -3,21 +3,22 @@
 
 use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, Shard, ShardKind};
+use magex_core::joint_state::{JointState, group_positions};
 use magex_core::keys::episode_keys;
 use magex_core::rng::{Key, Purpose, Stream, sequence};
-use magex_core::task::{ActionCode, Group, Stage};
+use magex_core::statics::{LANDMARKS, Statics};
+use magex_core::task::{ActionCode, Stage, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
-use magex_env::scripted::scripted;
-use magex_env::{Env, EnvError, View, new_env};
+use magex_env::{Controller, Env, EnvError, new_env, scripted};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{self, Input, Network};
-use magex_nets::features::{FeatureSpec, Features, JointStates, Symmetry};
+use magex_nets::features::{FeatureSpec, Features, Symmetry};
 use magex_nets::ops::GraphNoise;
 use magex_nets::params::{ParamError, Params, Source, from_safetensors};
 use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
 use std::sync::Arc;
 
-/// Why a shard could not be rolled out. E is the error of whoever hands out goals.
+/// Why a shard could not be rolled out. E is the error of the assignment of goals.
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError<E> {
     /// The environment refused.
@@ -45,8 +46,8 @@ pub enum RolloutError<E> {
 enum Driver {
     /// The executor's actor network.
     Policy(Box<dyn Network>),
-    /// The scripted controller: thrust that brings the predicted stopping point closest to the goal. A yardstick.
-    Scripted,
+    /// A controller without a network, made anew for every shard.
+    Controller(fn(&TaskConfig) -> Box<dyn Controller>),
 }
 
 /// Everything that is the same for all shards of a version of the weights.
@@ -84,10 +85,18 @@ impl Roller {
         Ok(Self { config: config.clone(), spec, heads, driver: Driver::Policy(network) })
     }
 
-    /// With the scripted controller instead of a policy (evaluation only).
+    /// With the task's scripted controller instead of a policy (evaluation only).
     pub fn scripted(config: &RunConfig) -> Result<Self, ParamError> {
+        Self::controlled(config, scripted)
+    }
+
+    /// With a controller instead of a policy (evaluation only).
+    pub fn controlled(
+        config: &RunConfig,
+        controller: fn(&TaskConfig) -> Box<dyn Controller>,
+    ) -> Result<Self, ParamError> {
         let spec = executor::feature_spec(&config.executor, &config.task);
-        Ok(Self { config: config.clone(), spec, heads: heads(config)?, driver: Driver::Scripted })
+        Ok(Self { config: config.clone(), spec, heads: heads(config)?, driver: Driver::Controller(controller) })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -104,12 +113,19 @@ impl Roller {
 
         // Reset, then goals, then the first observation: an agent never sees a goal of another episode.
         let mut worlds = new_env(task, keys.iter().map(|k| k.spawn.stream()), keep)?;
-        let mut state = JointState::new(&shape, worlds.landmarks());
+        let mut state = Buffers::new(&shape, worlds.statics());
         state.read(worlds.as_ref())?;
         let request = state.goal_request(&shape, task.stages(), shard, seed);
         let reply = assign(&request).map_err(RolloutError::Goals)?;
         state.goals = chain(&shape, &reply.goals);
         worlds.set_goals(&state.goals)?;
+        let mut controller = match &self.driver {
+            Driver::Policy(_) => None,
+            Driver::Controller(make) => Some(make(task)),
+        };
+        if let Some(controller) = &mut controller {
+            controller.begin(&state.joint_state())?;
+        }
 
         let mut out = columns(&shape, shard, keep);
         let mut recording = (Vec::new(), Vec::new());
@@ -131,9 +147,9 @@ impl Roller {
                 break;
             }
             let mut symmetries: Vec<Symmetry> = Vec::new();
-            match &self.driver {
-                Driver::Policy(network) => {
-                    let features = self.spec.compute(&state.joint_states());
+            match (&self.driver, &mut controller) {
+                (Driver::Policy(network), _) => {
+                    let features = self.spec.compute(&state.joint_state());
                     let logits = policy.logits(network.as_ref(), &features, step).map_err(ParamError::from)?;
                     if let Some(place) = logits.iter().position(|x| !x.is_finite()) {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
@@ -149,7 +165,8 @@ impl Roller {
                     }
                     symmetries = features.symmetries;
                 }
-                Driver::Scripted => scripted(task, &state.view(), &mut actions)?,
+                (Driver::Controller(_), Some(controller)) => controller.act(&state.joint_state(), &mut actions)?,
+                (Driver::Controller(_), None) => {}
             }
             if keep {
                 out.actions.extend_from_slice(&actions);
@@ -168,12 +185,12 @@ impl Roller {
                 shape: Shape { episodes: 1, ..shape },
                 positions: recording.0,
                 agent_state: recording.1,
-                landmarks: state.landmarks[..shape.landmarks * shape.dims].to_vec(),
+                statics: state.statics.episode(0).to_owned(),
                 goals: state.goals[..n * shape.goals_per_agent].to_vec(),
             });
             return Ok(ShardResult::Eval(EvalOutcome { shard: *shard, metrics, recording }));
         }
-        out.landmarks = state.landmarks;
+        out.statics = state.statics;
         out.goals = state.goals;
         out.goal_log_probs = reply.log_probs;
         out.costs = reply.costs;
@@ -183,23 +200,23 @@ impl Roller {
     }
 }
 
-/// What the agents of B episodes see of them.
-struct JointState {
+/// The joint states of B episodes at one step, read from the environment.
+struct Buffers {
     positions: Vec<f32>,
     velocities: Vec<f32>,
     agent_state: Vec<f32>,
-    landmarks: Vec<f32>,
+    statics: Statics,
     goals: Vec<u32>,
 }
 
-impl JointState {
-    fn new(shape: &Shape, landmarks: &[f32]) -> Self {
+impl Buffers {
+    fn new(shape: &Shape, statics: &Statics) -> Self {
         let state = shape.episodes * shape.bodies * shape.dims;
         Self {
             positions: vec![0.0; state],
             velocities: vec![0.0; state],
             agent_state: vec![0.0; shape.episodes * shape.agents * shape.agent_state],
-            landmarks: landmarks.to_vec(),
+            statics: statics.clone(),
             goals: Vec::new(),
         }
     }
@@ -210,42 +227,24 @@ impl JointState {
         worlds.write_agent_state(&mut self.agent_state)
     }
 
-    fn joint_states(&self) -> JointStates<'_> {
-        JointStates {
+    fn joint_state(&self) -> JointState<'_> {
+        JointState {
             positions: &self.positions,
             velocities: &self.velocities,
             agent_state: &self.agent_state,
-            landmarks: &self.landmarks,
-            goals: &self.goals,
-        }
-    }
-
-    fn view(&self) -> View<'_> {
-        View {
-            positions: &self.positions,
-            velocities: &self.velocities,
-            agent_state: &self.agent_state,
-            landmarks: &self.landmarks,
+            statics: self.statics.view(),
             goals: &self.goals,
         }
     }
 
     /// The assignment problems of all episodes as they start.
     fn goal_request(&self, shape: &Shape, stages: &[Stage], shard: &Shard, seed: u64) -> GoalRequest {
-        let group = |group: Group, episode: usize| {
-            let (points, per_episode, first) = match group {
-                Group::Agents => (&self.positions, shape.bodies, 0),
-                Group::Balls => (&self.positions, shape.bodies, shape.agents),
-                Group::Landmarks => (&self.landmarks, shape.landmarks, 0),
-            };
-            let from = (episode * per_episode + first) * shape.dims;
-            &points[from..from + shape.agents * shape.dims]
-        };
+        let points = (&*self.positions, self.statics.get(LANDMARKS));
         let (mut agents, mut goals) = (Vec::new(), Vec::new());
         for episode in 0..shape.episodes {
             for stage in stages {
-                agents.extend_from_slice(group(stage.from, episode));
-                goals.extend_from_slice(group(stage.to, episode));
+                agents.extend_from_slice(group_positions(shape, points, stage.from, episode));
+                goals.extend_from_slice(group_positions(shape, points, stage.to, episode));
             }
         }
         GoalRequest {
@@ -316,7 +315,7 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         positions: Vec::with_capacity(state),
         velocities: Vec::with_capacity(state),
         agent_state: Vec::with_capacity(room((shape.steps + 1) * shape.episodes * shape.agents * shape.agent_state)),
-        landmarks: Vec::new(),
+        statics: Statics::default(),
         goals: Vec::new(),
         actions: Vec::with_capacity(rows * shape.action_components),
         log_probs: Vec::with_capacity(rows),
@@ -341,7 +340,7 @@ impl Policy {
         let agents = roller.config.task.agents;
         let memory = match &roller.driver {
             Driver::Policy(network) => network.memory(),
-            Driver::Scripted => 0,
+            Driver::Controller(_) => 0,
         };
         let noise = (shard.mode == Mode::Sampled).then(|| graph.iter().map(|key| key.stream().bits64()).collect());
         Self { hidden: vec![0.0; episodes * agents * memory], noise, episodes, agents }

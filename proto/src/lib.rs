@@ -23,7 +23,7 @@ pub fn encoded_len(message: &impl prost::Message) -> usize {
 }
 
 /// Version of the protocol that this build speaks; both sides of a handshake must agree on it.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;
 
 /// Longest message that any side decodes, bytes.
 pub const MAX_MESSAGE_BYTES: usize = 2 << 20;

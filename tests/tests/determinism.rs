@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex::local::LocalCollector;
-use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::{RunId, Shard};
 use magex_core::task::TaskName;
 use magex_core::trajectory::ShardResult;
@@ -144,7 +144,7 @@ fn the_first_importance_ratio_is_one() {
 
 #[test]
 fn every_scheduler_trains_and_the_learned_ones_change() {
-    for kind in [CommanderKind::Pairwise, CommanderKind::Ranking, CommanderKind::Exact, CommanderKind::Random] {
+    for kind in [CommanderPolicy::Pairwise, CommanderPolicy::Ranking, CommanderPolicy::Exact, CommanderPolicy::Random] {
         let mut config = small(ExecutorKind::Local, 5, 2);
         config.commander.kind = kind;
         let folder = tempfile::tempdir().unwrap();
@@ -156,7 +156,7 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
         let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
         let Outcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
         assert!(summary.cost_ratio >= 0.999, "{kind}: better than exact");
-        if kind == CommanderKind::Exact {
+        if kind == CommanderPolicy::Exact {
             assert!((summary.cost_ratio - 1.0).abs() < 1e-6);
         }
         assert_eq!(before.params.numbers.is_empty(), !kind.learned(), "{kind}");

@@ -4,8 +4,14 @@
 //! The learner knows a task only by its [`task::TaskConfig`]; the physics lives in `magex-env`.
 
 pub mod config;
+pub mod error;
 pub mod ids;
+pub mod joint_state;
 pub mod keys;
 pub mod rng;
+pub mod sha256;
+pub mod statics;
 pub mod task;
 pub mod trajectory;
+
+mod toml_table;

@@ -4,7 +4,6 @@ use crate::logging::set_live_line;
 use crate::output::{colours, note, share, thousands};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
-use magex_core::task::TaskName;
 use magex_learner::run_events::RunEvent;
 use serde::Deserialize;
 use std::io::IsTerminal as _;
@@ -63,7 +62,7 @@ impl Progress {
     /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
-        let crashes = config.task.name == TaskName::Drones;
+        let crashes = config.task.crashes();
         let terminal = std::io::stderr().is_terminal();
         if !terminal {
             tracing::info!(

@@ -8,7 +8,7 @@ use crate::folder;
 use crate::output::{Table, note, seconds, share};
 use crate::settings;
 use magex_core::ids::Mode;
-use magex_core::task::{Spawn, TaskConfig, TaskName};
+use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::metrics_file::{EvalSummary, summarise};
 use magex_runtime::exit;
@@ -185,7 +185,7 @@ fn columns(task: &TaskConfig) -> Vec<Column> {
         ("arrival", |s| format!("{:.1}", s.arrival_step)),
         ("collisions", |s| format!("{:.4}", s.collisions_per_agent_step)),
     ];
-    if task.name == TaskName::Drones {
+    if task.crashes() {
         columns.push(("crashed", |s| format!("{:.4}", s.collision_rate)));
     }
     columns.push(("cost", |s| format!("{:.4}", s.cost_ratio)));

@@ -12,7 +12,6 @@ use crate::supervise::{self, Crew};
 use anyhow::Context as _;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
-use magex_core::task::TaskName;
 use magex_learner::page::{LivePage, RunInfo};
 use magex_learner::trainer::{Outcome, TrainError, Trainer};
 use magex_runtime::{backoff, exit, http, server, shutdown};
@@ -312,7 +311,7 @@ fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, outpu
     ];
     let out = job.folder.display();
     output.say(format!("\nDone: {why}. On {episodes} episodes with starts that training never saw:\n"));
-    let crashes = job.config.task.name == TaskName::Drones;
+    let crashes = job.config.task.crashes();
     for (name, value) in rows.into_iter().filter(|(name, _)| crashes || *name != "collision rate") {
         output.say(format!("  {name:<16} {value}"));
     }

@@ -4,8 +4,8 @@
 //! when it is covered itself, so the usual cost of a step is one landmark instead of N. With N ≥ 100, where 99 % are
 //! enough, ⌊N / 100⌋ + 1 uncovered landmarks are the proof, found by a scan that starts at the witness.
 
-use crate::cells::Cells;
-use crate::real::Real;
+use super::cells::Cells;
+use super::real::Real;
 
 /// The arrival steps of a batch.
 #[derive(Debug, Clone)]

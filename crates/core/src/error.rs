@@ -1,0 +1,55 @@
+//! The error of a value that is not accepted: which field, and what is wrong with it.
+
+/// A field that is not accepted. The problem says what is wrong and, where there is one, the remedy.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {problem}")]
+pub struct FieldError {
+    /// Path of the field from the outermost section or message, separated by dots.
+    pub field: String,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+impl FieldError {
+    /// A problem with a field.
+    pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
+        Self { field: field.into(), problem: problem.into() }
+    }
+
+    /// A required field that is missing.
+    pub fn missing(field: impl Into<String>) -> Self {
+        Self::new(field, "missing")
+    }
+
+    /// The same problem, named from the section or message that encloses the field.
+    #[must_use]
+    pub fn within(self, outer: &str) -> Self {
+        Self { field: format!("{outer}.{}", self.field), problem: self.problem }
+    }
+}
+
+/// A name that is none of the known ones.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("unknown {what} '{name}'; use {choices}")]
+pub struct UnknownName {
+    /// What it should name.
+    pub what: &'static str,
+    /// The name given.
+    pub name: String,
+    /// The known names.
+    pub choices: &'static str,
+}
+
+/// `Ok` if the value is a number in `low..=high`.
+pub(crate) fn check_range<T: PartialOrd + std::fmt::Display>(
+    field: impl Into<String>,
+    value: T,
+    low: T,
+    high: T,
+) -> Result<(), FieldError> {
+    if value >= low && value <= high {
+        Ok(())
+    } else {
+        Err(FieldError::new(field, format!("{value} is outside {low}..={high}")))
+    }
+}
