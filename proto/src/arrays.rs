@@ -44,7 +44,7 @@ pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u
     checked(field, array, DataType::U8, shape, 1).map(|data| data.to_vec())
 }
 
-/// The shape of an array, which must have at most so many axes.
+/// The shape of an array, which must have at most `axes` axes.
 pub fn shape_up_to(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;
     if array.shape.len() > axes {
@@ -53,7 +53,7 @@ pub fn shape_up_to(field: &str, array: Option<&Array>, axes: usize) -> Result<Ve
     Ok(array.shape.iter().map(|&extent| extent as usize).collect())
 }
 
-/// The shape of an array, which must have exactly this number of axes.
+/// The shape of an array, which must have exactly `axes` axes.
 pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;
     if array.shape.len() != axes {

@@ -15,6 +15,7 @@ pub mod weights;
 #[allow(missing_docs, unreachable_pub, clippy::all)]
 pub mod v1 {
     tonic::include_proto!("magex.v1");
+    include!(concat!(env!("OUT_DIR"), "/sent.rs"));
 }
 
 /// Bytes that a message takes on the wire.

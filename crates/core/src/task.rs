@@ -294,7 +294,7 @@ impl TaskConfig {
         self.definition().observation
     }
 
-    /// Sizes of the arrays of a shard of so many episodes.
+    /// Sizes of the arrays of a shard of B = `episodes` episodes.
     pub fn shape(&self, episodes: usize) -> Shape {
         Shape {
             steps: self.horizon as usize,

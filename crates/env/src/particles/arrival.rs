@@ -87,7 +87,7 @@ impl<R: Real, const W: usize> Arrivals<R, W> {
         }
     }
 
-    /// Finds more than `allowed` uncovered landmarks and remembers the first; false if there are not so many.
+    /// Finds more than `allowed` uncovered landmarks and remembers the first; false if there are fewer.
     fn find_witness(&mut self, block: usize, w: usize, view: &View<'_, R, W>) -> bool {
         let n = view.x.len();
         let landmarks = &view.landmarks[2 * n * w..2 * n * (w + 1)];

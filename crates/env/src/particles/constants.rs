@@ -9,7 +9,7 @@ pub(crate) const LANES: usize = 16;
 /// Bodies from which neighbours are found by cells instead of comparing all pairs of 16 worlds at once.
 const CELLS_FROM: usize = 256;
 
-/// Whether worlds of so many bodies share registers; otherwise each is looked at by itself, its neighbours found by cells.
+/// Whether worlds of this many bodies share registers; otherwise each is looked at by itself, its neighbours found by cells.
 /// Fewer than bodies / 16 worlds do not fill the registers well enough to be worth it. Both ways give the same bits.
 pub(crate) fn share_registers(bodies: usize, worlds: usize) -> bool {
     bodies < CELLS_FROM && LANES * worlds >= bodies
