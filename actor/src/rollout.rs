@@ -1,13 +1,15 @@
 //! Rolling out a shard: a pure function of the shard, the run's seed and task, the weights it names, and the goals that
 //! the commander hands out. Nothing here knows a clock, a thread or an address.
 
+mod buffers;
+
+use buffers::{Buffers, chain};
 use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, Shard, ShardKind};
-use magex_core::joint_state::{JointState, group_positions};
 use magex_core::keys::episode_keys;
 use magex_core::rng::{Key, Purpose, Stream, sequence};
-use magex_core::statics::{LANDMARKS, Statics};
-use magex_core::task::{ActionCode, Stage, TaskConfig};
+use magex_core::statics::Statics;
+use magex_core::task::{ActionCode, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_env::{Controller, Env, EnvError, new_env, scripted};
 use magex_nets::distribution::ActionHeads;
@@ -15,7 +17,7 @@ use magex_nets::executor::{self, Input, Network};
 use magex_nets::features::{FeatureSpec, Features, Symmetry};
 use magex_nets::ops::GraphNoise;
 use magex_nets::params::{ParamError, Params, Source, from_safetensors};
-use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
+use magex_proto::goals::{GoalReply, GoalRequest};
 use std::sync::Arc;
 
 /// Why a shard could not be rolled out. E is the error of the assignment of goals.
@@ -198,85 +200,6 @@ impl Roller {
         out.metrics = metrics;
         Ok(ShardResult::Train(out))
     }
-}
-
-/// The joint states of B episodes at one step, read from the environment.
-struct Buffers {
-    positions: Vec<f32>,
-    velocities: Vec<f32>,
-    agent_state: Vec<f32>,
-    statics: Statics,
-    goals: Vec<u32>,
-}
-
-impl Buffers {
-    fn new(shape: &Shape, statics: &Statics) -> Self {
-        let state = shape.episodes * shape.bodies * shape.dims;
-        Self {
-            positions: vec![0.0; state],
-            velocities: vec![0.0; state],
-            agent_state: vec![0.0; shape.episodes * shape.agents * shape.agent_state],
-            statics: statics.clone(),
-            goals: Vec::new(),
-        }
-    }
-
-    fn read(&mut self, worlds: &dyn Env) -> Result<(), EnvError> {
-        worlds.write_positions(&mut self.positions)?;
-        worlds.write_velocities(&mut self.velocities)?;
-        worlds.write_agent_state(&mut self.agent_state)
-    }
-
-    fn joint_state(&self) -> JointState<'_> {
-        JointState {
-            positions: &self.positions,
-            velocities: &self.velocities,
-            agent_state: &self.agent_state,
-            statics: self.statics.view(),
-            goals: &self.goals,
-        }
-    }
-
-    /// The assignment problems of all episodes as they start.
-    fn goal_request(&self, shape: &Shape, stages: &[Stage], shard: &Shard, seed: u64) -> GoalRequest {
-        let points = (&*self.positions, self.statics.get(LANDMARKS));
-        let (mut agents, mut goals) = (Vec::new(), Vec::new());
-        for episode in 0..shape.episodes {
-            for stage in stages {
-                agents.extend_from_slice(group_positions(shape, points, stage.from, episode));
-                goals.extend_from_slice(group_positions(shape, points, stage.to, episode));
-            }
-        }
-        GoalRequest {
-            shard: *shard,
-            seed,
-            scheduler: SchedulerKind::Learned,
-            stages: stages.len(),
-            agent_count: shape.agents,
-            goal_count: shape.agents,
-            dims: shape.dims,
-            agents,
-            goals,
-        }
-    }
-}
-
-/// [B, K, N] assignments, stage by stage, to the [B, N, K] goals that each agent finds by following them.
-fn chain(shape: &Shape, assigned: &[u32]) -> Vec<u32> {
-    let (n, k) = (shape.agents, shape.goals_per_agent);
-    let mut goals = Vec::with_capacity(assigned.len());
-    for episode in assigned.chunks_exact(n * k) {
-        for agent in 0..n {
-            let mut at = agent;
-            for stage in episode.chunks_exact(n) {
-                // Out of range cannot be: the reply was checked. If it were, the environment would refuse it.
-                let next = stage.get(at).copied().unwrap_or(u32::MAX);
-                goals.push(next);
-                at = next as usize;
-            }
-        }
-    }
-    goals
 }
 
 /// Turns the policy's actions, in place, to the axes of the world; without frames they are along them already.

@@ -99,22 +99,18 @@ pub(super) const DEFINITION: Definition = Definition {
     validate,
 };
 
-fn settings(task: &TaskConfig) -> Result<&DroneConfig, FieldError> {
-    match &task.settings {
-        TaskSettings::Drones(settings) => Ok(settings),
-        _ => Err(wrong_task(task, TaskName::Drones)),
-    }
-}
-
 impl TaskConfig {
     /// What only the drones have; an error in any other task.
     pub fn drones(&self) -> Result<&DroneConfig, FieldError> {
-        settings(self)
+        match &self.settings {
+            TaskSettings::Drones(settings) => Ok(settings),
+            _ => Err(wrong_task(self, TaskName::Drones)),
+        }
     }
 }
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
-    let d = settings(task)?;
+    let d = task.drones()?;
     coefficients(
         "task.drones",
         &[

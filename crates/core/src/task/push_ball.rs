@@ -70,22 +70,18 @@ pub(super) const DEFINITION: Definition = Definition {
     validate,
 };
 
-fn settings(task: &TaskConfig) -> Result<&PushBallConfig, FieldError> {
-    match &task.settings {
-        TaskSettings::PushBall(settings) => Ok(settings),
-        _ => Err(wrong_task(task, TaskName::PushBall)),
-    }
-}
-
 impl TaskConfig {
     /// What only Push Ball has; an error in any other task.
     pub fn push_ball(&self) -> Result<&PushBallConfig, FieldError> {
-        settings(self)
+        match &self.settings {
+            TaskSettings::PushBall(settings) => Ok(settings),
+            _ => Err(wrong_task(self, TaskName::PushBall)),
+        }
     }
 }
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
-    let p = settings(task)?;
+    let p = task.push_ball()?;
     coefficients(
         "task.push_ball",
         &[("progress", p.progress), ("turn_length", p.turn_length), ("bonus", p.bonus), ("distance", p.distance)],

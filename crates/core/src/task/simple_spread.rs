@@ -86,19 +86,12 @@ pub(super) const DEFINITION: Definition = Definition {
 };
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
-    let r = reward(task)?;
+    let r = task.reward()?;
     coefficients("task.reward", &[("bonus", r.bonus), ("distance", r.distance), ("collision", r.collision)])?;
     if !(r.distance_unit.is_finite() && r.distance_unit > 0.0) {
         return Err(FieldError::new("task.reward.distance_unit", format!("{} must be positive", r.distance_unit)));
     }
     if task.spawn == Spawn::Uniform { fits(task, "agents", task.agents, 0.2) } else { Ok(()) }
-}
-
-fn reward(task: &TaskConfig) -> Result<&RewardConfig, FieldError> {
-    match &task.settings {
-        TaskSettings::SimpleSpread(reward) => Ok(reward),
-        _ => Err(wrong_task(task, TaskName::SimpleSpread)),
-    }
 }
 
 impl TaskConfig {
@@ -109,7 +102,10 @@ impl TaskConfig {
 
     /// What only Simple Spread has; an error in any other task.
     pub fn reward(&self) -> Result<&RewardConfig, FieldError> {
-        reward(self)
+        match &self.settings {
+            TaskSettings::SimpleSpread(reward) => Ok(reward),
+            _ => Err(wrong_task(self, TaskName::SimpleSpread)),
+        }
     }
 }
 
