@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn an_unreadable_request_is_the_callers_error_and_names_the_field() {
-        assert!(crate::v1::AssignRequest::BY_CALLER && !crate::v1::AssignResponse::BY_CALLER);
+        assert_eq!([crate::v1::AssignRequest::BY_CALLER, crate::v1::AssignResponse::BY_CALLER], [true, false]);
         for (bytes, field) in [
             // A number where a message belongs; within a message; a name that is no text; an end that is missing.
             (&[0x08, 0x01][..], "agents"),
