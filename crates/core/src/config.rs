@@ -20,7 +20,14 @@ pub enum ConfigError {
     Syntax(String),
     /// A key that does not exist, or a value of the wrong type or out of its range.
     #[error("configuration: {0}")]
-    Field(#[from] FieldError),
+    Field(FieldError),
+}
+
+// Not a source: the message holds all of it, and reports that follow the sources would say it twice.
+impl From<FieldError> for ConfigError {
+    fn from(error: FieldError) -> Self {
+        Self::Field(error)
+    }
 }
 
 /// Everything that decides the numbers of a run, and nothing that does not (addresses, thread counts and folders are

@@ -28,7 +28,9 @@ fn unknown_keys_and_bad_values_are_named() {
         ("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'ring'", "task.spawn: unknown spawn mode 'ring'"),
         ("[commander]\nkind = 'best'", "commander.kind: unknown variant `best`"),
     ] {
-        let error = RunConfig::from_toml(text).unwrap_err().to_string();
+        let error = RunConfig::from_toml(text).unwrap_err();
+        assert!(std::error::Error::source(&error).is_none(), "{text}: reported twice");
+        let error = error.to_string();
         assert!(error.contains(name), "{text}: {error}");
     }
 }
