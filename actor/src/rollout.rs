@@ -1,21 +1,23 @@
 //! Rolling out a shard: a pure function of the shard, the run's seed and task, the weights it names, and the goals that
 //! the commander hands out. Nothing here knows a clock, a thread or an address.
 
+mod buffers;
 mod policy;
 
 use self::policy::{Carried, KeyedChooser};
+use buffers::{Buffers, chain};
 use magex_core::config::RunConfig;
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
-use magex_core::task::{ActionCode, Group, Stage};
+use magex_core::statics::Statics;
+use magex_core::task::{ActionCode, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
-use magex_env::scripted::scripted;
-use magex_env::{Env, EnvError, View, new_env};
+use magex_env::{Controller, Env, EnvError, new_env, scripted};
 use magex_nets::executor::{Model, Policy};
-use magex_nets::features::{JointStates, Symmetry};
+use magex_nets::features::Symmetry;
 use magex_nets::params::ParamError;
-use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
+use magex_proto::goals::{GoalReply, GoalRequest};
 
 /// Why a shard could not be rolled out. E is the error of the commander's client.
 #[derive(Debug, thiserror::Error)]
@@ -45,8 +47,8 @@ pub enum RolloutError<E> {
 enum Driver {
     /// The executor's policy.
     Policy(Box<dyn Policy>),
-    /// The scripted controller: thrust that brings the predicted stopping point closest to the goal. A yardstick.
-    Scripted,
+    /// A controller without a network, made anew for every shard.
+    Controller(fn(&TaskConfig) -> Box<dyn Controller>),
 }
 
 /// Everything that is the same for all shards of a version of the weights.
@@ -71,9 +73,17 @@ impl Roller {
         Ok(Self { config: config.clone(), model, driver })
     }
 
-    /// With the scripted controller instead of a policy (evaluation only).
+    /// With the task's scripted controller instead of a policy (evaluation only).
     pub fn scripted(config: &RunConfig) -> Result<Self, ParamError> {
-        Ok(Self { config: config.clone(), model: Model::new(config)?, driver: Driver::Scripted })
+        Self::controlled(config, scripted)
+    }
+
+    /// With a controller instead of a policy (evaluation only).
+    pub fn controlled(
+        config: &RunConfig,
+        controller: fn(&TaskConfig) -> Box<dyn Controller>,
+    ) -> Result<Self, ParamError> {
+        Ok(Self { config: config.clone(), model: Model::new(config)?, driver: Driver::Controller(controller) })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -90,12 +100,19 @@ impl Roller {
 
         // Reset, then goals, then the first observation: an agent never sees a goal of another episode.
         let mut worlds = new_env(task, keys.iter().map(|k| k.spawn.stream()), keep)?;
-        let mut state = JointState::new(&shape, worlds.landmarks());
+        let mut state = Buffers::new(&shape, worlds.statics());
         state.read(worlds.as_ref())?;
         let request = state.goal_request(&shape, task.stages(), shard, seed);
         let reply = assign(&request).map_err(RolloutError::Goals)?;
         state.goals = chain(&shape, &reply.goals);
         worlds.set_goals(&state.goals)?;
+        let mut controller = match &self.driver {
+            Driver::Policy(_) => None,
+            Driver::Controller(make) => Some(make(task)),
+        };
+        if let Some(controller) = &mut controller {
+            controller.begin(&state.joint_state())?;
+        }
 
         let mut out = columns(&shape, shard, keep);
         let mut recording = (Vec::new(), Vec::new());
@@ -116,16 +133,17 @@ impl Roller {
                 break;
             }
             let mut symmetries: Vec<Symmetry> = Vec::new();
-            match &self.driver {
-                Driver::Policy(policy) => {
-                    let features = self.model.spec().compute(&state.joint_states());
+            match (&self.driver, &mut controller) {
+                (Driver::Policy(policy), _) => {
+                    let features = self.model.spec().compute(&state.joint_state());
                     carried.act(policy.as_ref(), &features, step, &mut chosen).map_err(ParamError::from)?;
                     if let Some(place) = chosen.not_finite {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
                     }
                     symmetries = features.symmetries;
                 }
-                Driver::Scripted => scripted(task, &state.view(), &mut chosen.actions)?,
+                (Driver::Controller(_), Some(controller)) => controller.act(&state.joint_state(), &mut chosen.actions)?,
+                (Driver::Controller(_), None) => {}
             }
             if keep {
                 out.actions.extend_from_slice(&chosen.actions);
@@ -144,12 +162,12 @@ impl Roller {
                 shape: Shape { episodes: 1, ..shape },
                 positions: recording.0,
                 agent_state: recording.1,
-                landmarks: state.landmarks[..shape.landmarks * shape.dims].to_vec(),
+                statics: state.statics.episode(0).to_owned(),
                 goals: state.goals[..n * shape.goals_per_agent].to_vec(),
             });
             return Ok(ShardResult::Eval(EvalOutcome { shard: *shard, metrics, recording }));
         }
-        out.landmarks = state.landmarks;
+        out.statics = state.statics;
         out.goals = state.goals;
         out.goal_log_probs = reply.log_probs;
         out.costs = reply.costs;
@@ -157,103 +175,6 @@ impl Roller {
         out.metrics = metrics;
         Ok(ShardResult::Train(out))
     }
-}
-
-/// What the agents of B episodes see of them.
-struct JointState {
-    positions: Vec<f32>,
-    velocities: Vec<f32>,
-    agent_state: Vec<f32>,
-    landmarks: Vec<f32>,
-    goals: Vec<u32>,
-}
-
-impl JointState {
-    fn new(shape: &Shape, landmarks: &[f32]) -> Self {
-        let state = shape.episodes * shape.bodies * shape.dims;
-        Self {
-            positions: vec![0.0; state],
-            velocities: vec![0.0; state],
-            agent_state: vec![0.0; shape.episodes * shape.agents * shape.agent_state],
-            landmarks: landmarks.to_vec(),
-            goals: Vec::new(),
-        }
-    }
-
-    fn read(&mut self, worlds: &dyn Env) -> Result<(), EnvError> {
-        worlds.write_positions(&mut self.positions)?;
-        worlds.write_velocities(&mut self.velocities)?;
-        worlds.write_agent_state(&mut self.agent_state)
-    }
-
-    fn joint_states(&self) -> JointStates<'_> {
-        JointStates {
-            positions: &self.positions,
-            velocities: &self.velocities,
-            agent_state: &self.agent_state,
-            landmarks: &self.landmarks,
-            goals: &self.goals,
-        }
-    }
-
-    fn view(&self) -> View<'_> {
-        View {
-            positions: &self.positions,
-            velocities: &self.velocities,
-            agent_state: &self.agent_state,
-            landmarks: &self.landmarks,
-            goals: &self.goals,
-        }
-    }
-
-    /// The assignment problems of all episodes as they start.
-    fn goal_request(&self, shape: &Shape, stages: &[Stage], shard: &Shard, seed: u64) -> GoalRequest {
-        let group = |group: Group, episode: usize| {
-            let (points, per_episode, first) = match group {
-                Group::Agents => (&self.positions, shape.bodies, 0),
-                Group::Balls => (&self.positions, shape.bodies, shape.agents),
-                Group::Landmarks => (&self.landmarks, shape.landmarks, 0),
-            };
-            let from = (episode * per_episode + first) * shape.dims;
-            &points[from..from + shape.agents * shape.dims]
-        };
-        let (mut agents, mut goals) = (Vec::new(), Vec::new());
-        for episode in 0..shape.episodes {
-            for stage in stages {
-                agents.extend_from_slice(group(stage.from, episode));
-                goals.extend_from_slice(group(stage.to, episode));
-            }
-        }
-        GoalRequest {
-            shard: *shard,
-            seed,
-            scheduler: SchedulerKind::Learned,
-            stages: stages.len(),
-            agent_count: shape.agents,
-            goal_count: shape.agents,
-            dims: shape.dims,
-            agents,
-            goals,
-        }
-    }
-}
-
-/// [B, K, N] assignments, stage by stage, to the [B, N, K] goals that each agent finds by following them.
-fn chain(shape: &Shape, assigned: &[u32]) -> Vec<u32> {
-    let (n, k) = (shape.agents, shape.goals_per_agent);
-    let mut goals = Vec::with_capacity(assigned.len());
-    for episode in assigned.chunks_exact(n * k) {
-        for agent in 0..n {
-            let mut at = agent;
-            for stage in episode.chunks_exact(n) {
-                // Out of range cannot be: the reply was checked. If it were, the environment would refuse it.
-                let next = stage.get(at).copied().unwrap_or(u32::MAX);
-                goals.push(next);
-                at = next as usize;
-            }
-        }
-    }
-    goals
 }
 
 /// Turns the policy's actions, in place, to the axes of the world; without frames they are along them already.
@@ -288,7 +209,7 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         positions: Vec::with_capacity(state),
         velocities: Vec::with_capacity(state),
         agent_state: Vec::with_capacity(room((shape.steps + 1) * shape.episodes * shape.agents * shape.agent_state)),
-        landmarks: Vec::new(),
+        statics: Statics::default(),
         goals: Vec::new(),
         actions: Vec::with_capacity(rows * shape.action_components),
         log_probs: Vec::with_capacity(rows),

@@ -75,7 +75,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
     use super::*;
-    use magex_core::config::CommanderKind;
+    use magex_core::config::CommanderPolicy;
     use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
     use magex_proto::goals::SchedulerKind;
 
@@ -96,7 +96,7 @@ mod tests {
         let (agents, goals) = (vec![0.0, 0.0], vec![1.0, 0.0]);
         let (stages, agent_count, goal_count, dims) = (1, 1, 1, 2);
         let good = GoalRequest { shard, seed: 1, scheduler, stages, agent_count, goal_count, dims, agents, goals };
-        let commander = Commander::classical(CommanderKind::Exact).unwrap();
+        let commander = Commander::classical(CommanderPolicy::Exact).unwrap();
         assert_eq!(answer(&commander, 0.0, &good, &|| true).unwrap().goals, [0]);
         assert!(matches!(answer(&commander, 0.0, &good, &|| false), Err(CommanderError::Interrupted)));
         let empty = GoalRequest { agents: Vec::new(), goals: Vec::new(), ..good };

@@ -7,6 +7,7 @@ use crate::trainer::TrainError;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::Statics;
 use magex_core::trajectory::Trajectory;
 use std::time::Instant;
 
@@ -98,7 +99,7 @@ fn synthetic(config: &RunConfig, episodes: usize) -> Trajectory {
         positions,
         velocities,
         agent_state: vec![0.0; (t + 1) * b * n * shape.agent_state],
-        landmarks,
+        statics: Statics::landmarks(n, shape.dims, landmarks),
         goals: (0..b * n).flat_map(|i| std::iter::repeat_n((i % n) as u32, shape.goals_per_agent)).collect(),
         actions: (0..t * b * n)
             .flat_map(|_| choices.iter().map(|&c| stream.below(c as u32) as u8).collect::<Vec<_>>())

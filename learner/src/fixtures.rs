@@ -2,6 +2,7 @@
 
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::{METRICS, REWARD, SECOND_COST_RATIO, SUCCESS_RATE};
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, Trajectory};
 
@@ -43,7 +44,7 @@ pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
         positions: vec![0.5; (t + 1) * b * n * 2],
         velocities: vec![0.1; (t + 1) * b * n * 2],
         agent_state: vec![],
-        landmarks: vec![0.2; b * n * 2],
+        statics: Statics::landmarks(n, 2, vec![0.2; b * n * 2]),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
         log_probs: vec![-1.0; t * b * n],
@@ -63,7 +64,7 @@ pub(crate) fn eval_outcome(task: &TaskConfig, mut shard: Shard, record: bool) ->
         shape,
         positions: vec![0.5; (shape.steps + 1) * n * 2],
         agent_state: vec![],
-        landmarks: vec![0.2; n * 2],
+        statics: Statics::landmarks(n, 2, vec![0.2; n * 2]),
         goals: (0..n as u32).collect(),
     });
     EvalOutcome { shard, metrics: metrics(shard.episodes as usize), recording }

@@ -1,8 +1,8 @@
 //! Arrays on the wire: little-endian bytes with a type and a shape.
 
-use crate::convert::ConvertError;
 use crate::v1::{Array, DataType};
 use bytes::Bytes;
+use magex_core::error::FieldError;
 
 /// An f32 array of the given shape.
 pub fn from_f32(shape: &[usize], values: &[f32]) -> Array {
@@ -28,29 +28,38 @@ pub fn from_u8(shape: &[usize], values: &[u8]) -> Array {
 }
 
 /// The numbers of an f32 array that must have exactly this shape.
-pub fn to_f32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f32>, ConvertError> {
+pub fn to_f32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f32>, FieldError> {
     let data = checked(field, array, DataType::F32, shape, 4)?;
     Ok(data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
 }
 
 /// The numbers of a u32 array that must have exactly this shape.
-pub fn to_u32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u32>, ConvertError> {
+pub fn to_u32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u32>, FieldError> {
     let data = checked(field, array, DataType::U32, shape, 4)?;
     Ok(data.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
 }
 
 /// The numbers of a u8 array that must have exactly this shape.
-pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u8>, ConvertError> {
+pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u8>, FieldError> {
     checked(field, array, DataType::U8, shape, 1).map(|data| data.to_vec())
 }
 
-/// The shape of an array, which must have so many axes. `None` when the array is missing.
-pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, ConvertError> {
-    let array = array.ok_or_else(|| ConvertError::missing(field))?;
-    if array.shape.len() != axes {
-        return Err(ConvertError::new(field, format!("its shape has {} axes, not {axes}", array.shape.len())));
+/// The shape of an array, which must have at most `axes` axes.
+pub fn shape_up_to(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
+    let array = array.ok_or_else(|| FieldError::missing(field))?;
+    if array.shape.len() > axes {
+        return Err(FieldError::new(field, format!("a shape of {} axes, at most {axes} are known", array.shape.len())));
     }
     Ok(array.shape.iter().map(|&extent| extent as usize).collect())
+}
+
+/// The shape of an array, which must have exactly `axes` axes.
+pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
+    let array = array.ok_or_else(|| FieldError::missing(field))?;
+    if array.shape.len() != axes {
+        return Err(FieldError::new(field, format!("its shape has {} axes, not {axes}", array.shape.len())));
+    }
+    shape_up_to(field, Some(array), axes)
 }
 
 fn array(kind: DataType, shape: &[usize], data: Vec<u8>) -> Array {
@@ -64,25 +73,25 @@ fn checked(
     kind: DataType,
     shape: &[usize],
     size: usize,
-) -> Result<Bytes, ConvertError> {
-    let array = array.ok_or_else(|| ConvertError::missing(field))?;
+) -> Result<Bytes, FieldError> {
+    let array = array.ok_or_else(|| FieldError::missing(field))?;
     if array.r#type() != kind {
-        return Err(ConvertError::new(
+        return Err(FieldError::new(
             field,
             format!("type {} where {} is expected", array.r#type().as_str_name(), kind.as_str_name()),
         ));
     }
     if !array.shape.iter().map(|&extent| extent as usize).eq(shape.iter().copied()) {
-        // A shape of a million axes is not repeated to whoever sent it.
+        // A shape of a million axes is not repeated to its sender.
         let found = match array.shape.len() {
             0..=8 => format!("shape {:?}", array.shape),
             axes => format!("a shape of {axes} axes"),
         };
-        return Err(ConvertError::new(field, format!("{found} where {shape:?} is expected")));
+        return Err(FieldError::new(field, format!("{found} where {shape:?} is expected")));
     }
     let expected = shape.iter().try_fold(size, |product, &extent| product.checked_mul(extent));
     if expected != Some(array.data.len()) {
-        return Err(ConvertError::new(field, format!("{} bytes do not fill shape {shape:?}", array.data.len())));
+        return Err(FieldError::new(field, format!("{} bytes do not fill shape {shape:?}", array.data.len())));
     }
     Ok(array.data)
 }

@@ -1,8 +1,8 @@
 //! How messages are put into frames: as protobuf, followed by a checksum of their bytes.
 //!
-//! TCP's own checksum lets some damage pass, and what passes could be a number of a run: the shard of a lease, a goal, the
-//! seed. The checksum is a field (the highest that protobuf has) behind the last one of every message. Programs that
-//! do not know it skip it as protobuf asks of them, and their messages, which come without, are taken as they are.
+//! TCP's own checksum lets some damage pass, and the damaged bytes could be a number of a run: the shard of a lease, a goal,
+//! the seed. The checksum is a field (the highest that protobuf has) behind the last one of every message. Programs that
+//! do not know it skip it as an unknown field, and messages without it are accepted as they are.
 
 use crate::elements;
 use bytes::{Buf as _, BufMut as _, Bytes};
@@ -31,10 +31,16 @@ impl<T, U> Default for CheckedCodec<T, U> {
     }
 }
 
+/// A message of a service; implemented for every input and output of every method, from the descriptor.
+pub trait Sent {
+    /// Whether callers send it: what is wrong with it is then theirs to put right.
+    const BY_CALLER: bool;
+}
+
 impl<T, U> Codec for CheckedCodec<T, U>
 where
     T: Message + Send + 'static,
-    U: Message + Default + Send + 'static,
+    U: Message + Default + Sent + Send + 'static,
 {
     type Encode = T;
     type Decode = U;
@@ -78,13 +84,13 @@ thread_local! {
 /// What a thread keeps, bytes.
 const MAX_SCRATCH: usize = 2 << 20;
 
-impl<T, U: Message + Default + 'static> Decoder for CheckedCodec<T, U> {
+impl<T, U: Message + Default + Sent + 'static> Decoder for CheckedCodec<T, U> {
     type Item = U;
     type Error = Status;
 
     fn decode(&mut self, frame: &mut DecodeBuf<'_>) -> Result<Option<U>, Status> {
         let bytes = checked(frame.copy_to_bytes(frame.remaining()))?;
-        if !is_request::<U>() {
+        if !U::BY_CALLER {
             return U::decode(bytes).map(Some).map_err(|error| Status::internal(error.to_string()));
         }
         elements::check::<U>(&bytes).map_err(|limit| {
@@ -95,17 +101,13 @@ impl<T, U: Message + Default + 'static> Decoder for CheckedCodec<T, U> {
     }
 }
 
-/// A message that callers send: what is wrong with it is theirs to put right.
-fn is_request<U>() -> bool {
-    std::any::type_name::<U>().ends_with("Request")
-}
-
 fn invalid(field: &str, problem: String) -> Status {
     let details = ErrorDetails::with_bad_request_violation(field, &*problem);
     Status::with_error_details(Code::InvalidArgument, format!("{field}: {problem}"), details)
 }
 
-/// What the decoder says, `…: Inner.field: Outer.field: problem`, as path and problem.
+/// What the decoder says, `…: Inner.field: Outer.field: problem`, as path and problem. prost keeps the path to itself but for
+/// this text.
 fn unreadable(error: &str) -> Status {
     let mut path = Vec::new();
     let mut problem = error.strip_prefix("failed to decode Protobuf message: ").unwrap_or(error);
@@ -163,8 +165,8 @@ mod tests {
     }
 
     #[test]
-    fn a_request_that_cannot_be_read_is_its_senders_and_names_the_field() {
-        assert!(is_request::<crate::v1::AssignRequest>() && !is_request::<crate::v1::AssignResponse>());
+    fn an_unreadable_request_is_the_callers_error_and_names_the_field() {
+        assert_eq!([crate::v1::AssignRequest::BY_CALLER, crate::v1::AssignResponse::BY_CALLER], [true, false]);
         for (bytes, field) in [
             // A number where a message belongs; within a message; a name that is no text; an end that is missing.
             (&[0x08, 0x01][..], "agents"),
@@ -181,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_knows_nothing_of_checksums_reads_and_is_read() {
+    fn a_peer_without_checksums_reads_and_is_read() {
         let message = Ack { lease_id: 7, verdict: 1, reason: "because".into() };
         assert_eq!(Ack::decode(framed(&message).as_slice()).unwrap(), message);
         assert_eq!(Ack::decode(checked(message.encode_to_vec().into()).unwrap()).unwrap(), message);

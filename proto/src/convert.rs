@@ -4,36 +4,12 @@ use crate::{arrays, v1};
 use bytes::Bytes;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
+use magex_core::statics::{StaticArray, Statics};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use prost::Message as _;
 
-/// A message that does not describe what it claims to.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{field}: {problem}")]
-pub struct ConvertError {
-    /// Path of the field, from the outermost message.
-    pub field: String,
-    /// What is wrong with it.
-    pub problem: String,
-}
-
-impl ConvertError {
-    /// A problem with a field.
-    pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
-        Self { field: field.into(), problem: problem.into() }
-    }
-
-    /// A field that is needed and not there.
-    pub fn missing(field: impl Into<String>) -> Self {
-        Self::new(field, "missing")
-    }
-
-    /// The same problem, seen from the message that encloses the field.
-    #[must_use]
-    pub fn within(self, outer: &str) -> Self {
-        Self { field: format!("{outer}.{}", self.field), problem: self.problem }
-    }
-}
+/// A message that does not describe what it claims to; the field is its path from the outermost message.
+pub use magex_core::error::FieldError as ConvertError;
 
 impl From<ShardKind> for v1::ShardKind {
     fn from(kind: ShardKind) -> Self {
@@ -143,6 +119,32 @@ fn to_metrics(message: Option<v1::Array>, episodes: usize) -> Result<Vec<Episode
     Ok(values.as_chunks().0.iter().map(|episode| EpisodeMetrics(*episode)).collect())
 }
 
+/// The static arrays of B episodes, each [B, ...].
+fn named_arrays(episodes: usize, statics: &Statics) -> Vec<v1::NamedArray> {
+    let named = |array: &StaticArray| {
+        let shape = [&[episodes], &*array.shape].concat();
+        v1::NamedArray { name: array.name.clone(), array: Some(arrays::from_f32(&shape, &array.values)) }
+    };
+    statics.0.iter().map(named).collect()
+}
+
+/// The reverse of [`named_arrays`]. Which arrays there must be only the task knows.
+fn statics(episodes: usize, message: Vec<v1::NamedArray>) -> Result<Statics, ConvertError> {
+    let read = |(place, v1::NamedArray { name, array }): (usize, v1::NamedArray)| {
+        let field = format!("statics[{place}]");
+        let shape = arrays::shape_up_to(&field, array.as_ref(), MAX_STATIC_AXES)?;
+        if shape.first() != Some(&episodes) {
+            return Err(ConvertError::new(field, format!("shape {shape:?} where {episodes} episodes are expected")));
+        }
+        let values = arrays::to_f32(&field, array, &shape)?;
+        Ok(StaticArray { name, shape: shape[1..].to_vec(), values })
+    };
+    message.into_iter().enumerate().map(read).collect::<Result<_, _>>().map(Statics)
+}
+
+/// Most axes of a static array on the wire, that of the episodes included.
+const MAX_STATIC_AXES: usize = 4;
+
 impl From<&Trajectory> for v1::Trajectory {
     fn from(trajectory: &Trajectory) -> Self {
         let s = &trajectory.shape;
@@ -153,7 +155,7 @@ impl From<&Trajectory> for v1::Trajectory {
             positions: Some(arrays::from_f32(&state, &trajectory.positions)),
             velocities: Some(arrays::from_f32(&state, &trajectory.velocities)),
             agent_state: Some(arrays::from_f32(&[t + 1, b, n, s.agent_state], &trajectory.agent_state)),
-            landmarks: Some(arrays::from_f32(&[b, s.landmarks, s.dims], &trajectory.landmarks)),
+            statics: named_arrays(b, &trajectory.statics),
             goals: Some(arrays::from_u32(&[b, n, s.goals_per_agent], &trajectory.goals)),
             actions: Some(arrays::from_u8(&[t, b, n, s.action_components], &trajectory.actions)),
             log_probs: Some(arrays::from_f32(&[t, b, n], &trajectory.log_probs)),
@@ -177,7 +179,7 @@ fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, Conve
         positions: arrays::to_f32("positions", message.positions, &state)?,
         velocities: arrays::to_f32("velocities", message.velocities, &state)?,
         agent_state: arrays::to_f32("agent_state", message.agent_state, &[t + 1, b, n, s.agent_state])?,
-        landmarks: arrays::to_f32("landmarks", message.landmarks, &[b, s.landmarks, s.dims])?,
+        statics: statics(b, message.statics)?,
         goals: arrays::to_u32("goals", message.goals, &[b, n, s.goals_per_agent])?,
         actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.action_components])?,
         log_probs: arrays::to_f32("log_probs", message.log_probs, &[t, b, n])?,
@@ -196,7 +198,7 @@ impl From<&Recording> for v1::Recording {
             shape: Some(s.into()),
             positions: Some(arrays::from_f32(&[s.steps + 1, s.bodies, s.dims], &recording.positions)),
             agent_state: Some(arrays::from_f32(&[s.steps + 1, s.agents, s.agent_state], &recording.agent_state)),
-            landmarks: Some(arrays::from_f32(&[s.landmarks, s.dims], &recording.landmarks)),
+            statics: named_arrays(1, &recording.statics),
             goals: Some(arrays::from_u32(&[s.agents, s.goals_per_agent], &recording.goals)),
         }
     }
@@ -211,7 +213,7 @@ impl TryFrom<v1::Recording> for Recording {
             shape,
             positions: arrays::to_f32("positions", message.positions, &[s.steps + 1, s.bodies, s.dims])?,
             agent_state: arrays::to_f32("agent_state", message.agent_state, &[s.steps + 1, s.agents, s.agent_state])?,
-            landmarks: arrays::to_f32("landmarks", message.landmarks, &[s.landmarks, s.dims])?,
+            statics: statics(1, message.statics)?,
             goals: arrays::to_u32("goals", message.goals, &[s.agents, s.goals_per_agent])?,
         })
     }

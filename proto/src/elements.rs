@@ -1,7 +1,7 @@
 //! How many elements a request has, counted before it is decoded.
 //!
 //! On the wire an empty element of a repeated field takes two bytes, decoded it takes up to some hundred: without a bound, a
-//! message of a few mebibytes would fill gigabytes before anybody could look at it.
+//! message of a few mebibytes would fill gigabytes before it could be checked.
 
 use crate::v1;
 use prost::encoding::{WireType, decode_varint};
@@ -10,7 +10,7 @@ use std::any::TypeId;
 /// Elements that any request may have. Each [`BYTES_PER_ELEMENT`] of the request allow one more.
 pub const ELEMENTS: usize = 131_072;
 
-/// A request whose elements take so many bytes on the wire each, on average, may have as many as fit.
+/// A request whose elements take this many bytes on the wire each, on average, may have as many as fit.
 pub const BYTES_PER_ELEMENT: usize = 16;
 
 /// Elements that a team in a request for several counts as.

@@ -1,7 +1,8 @@
 //! What an actor asks of the commander, and the answer.
 
-use crate::convert::{self, ConvertError};
+use crate::convert;
 use crate::{arrays, v1};
+use magex_core::error::FieldError;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use std::fmt;
 
@@ -121,10 +122,10 @@ impl GoalRequest {
     }
 
     /// Reads a message: the request, and the weights that are to answer. Positions are finite afterwards.
-    pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), ConvertError> {
+    pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), FieldError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
         let scheduler = v1::SchedulerKind::try_from(message.scheduler)
-            .map_err(|_| ConvertError::new("scheduler", format!("{} is unknown", message.scheduler)))?
+            .map_err(|_| FieldError::new("scheduler", format!("{} is unknown", message.scheduler)))?
             .into();
         let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;
         let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 4)?;
@@ -132,7 +133,7 @@ impl GoalRequest {
         let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
         let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
         if stages == 0 {
-            return Err(ConvertError::new("agents", "no stage; send at least one assignment problem per episode"));
+            return Err(FieldError::new("agents", "no stage; send at least one assignment problem per episode"));
         }
         let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
@@ -156,15 +157,15 @@ impl GoalReply {
     }
 
     /// Reads the answer to a request: shapes fit, numbers are finite, and goals exist.
-    pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, ConvertError> {
+    pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, FieldError> {
         let problems = [request.shard.episodes as usize, request.stages];
         if message.version != request.shard.version.0 {
             let problem = format!("version {} answered, {} was asked", message.version, request.shard.version);
-            return Err(ConvertError::new("version", problem));
+            return Err(FieldError::new("version", problem));
         }
         let goals = arrays::to_u32("goals", message.goals, &[problems[0], problems[1], request.agent_count])?;
         if let Some(goal) = goals.iter().find(|&&goal| goal as usize >= request.goal_count) {
-            return Err(ConvertError::new("goals", format!("{goal} is not below {}", request.goal_count)));
+            return Err(FieldError::new("goals", format!("{goal} is not below {}", request.goal_count)));
         }
         Ok(Self {
             goals,
@@ -175,9 +176,9 @@ impl GoalReply {
     }
 }
 
-fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, ConvertError> {
+fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, FieldError> {
     match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => Err(ConvertError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
+        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
         None => Ok(values),
     }
 }
@@ -231,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scheduler_that_nobody_knows_is_refused() {
+    fn an_unknown_scheduler_is_refused() {
         let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
         let message = v1::AssignBatchRequest { scheduler: 77, ..request().to_message(&key) };
         assert_eq!(GoalRequest::from_message(message).unwrap_err().to_string(), "scheduler: 77 is unknown");

@@ -16,6 +16,7 @@ pub mod weights_watch;
 #[allow(missing_docs, unreachable_pub, clippy::all)]
 pub mod v1 {
     tonic::include_proto!("magex.v1");
+    include!(concat!(env!("OUT_DIR"), "/sent.rs"));
 }
 
 /// Bytes that a message takes on the wire.
@@ -24,7 +25,7 @@ pub fn encoded_len(message: &impl prost::Message) -> usize {
 }
 
 /// Version of the protocol that this build speaks; both sides of a handshake must agree on it.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;
 
 /// Longest message that any side decodes, bytes.
 pub const MAX_MESSAGE_BYTES: usize = 2 << 20;

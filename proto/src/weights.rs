@@ -1,11 +1,13 @@
 //! One version of a run's weights, whole and verified.
 
-use crate::convert::ConvertError;
 use crate::parts::{Assembler, split};
 use crate::v1::WatchWeightsResponse;
 use bytes::Bytes;
+use magex_core::error::FieldError;
 use magex_core::ids::{RunId, WeightsVersion};
-use sha2::{Digest as _, Sha256};
+
+/// SHA-256 as lower-case hex.
+pub use magex_core::sha256::hex as sha256_hex;
 
 /// Longest weights that a subscriber takes, bytes.
 pub const MAX_WEIGHTS_BYTES: usize = 1 << 30;
@@ -41,11 +43,6 @@ impl Weights {
     }
 }
 
-/// SHA-256 as lower-case hex.
-pub fn sha256_hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
 /// Makes weights of the messages of a weights stream. Nothing unverified leaves it.
 #[derive(Debug)]
 pub struct WeightsAssembler {
@@ -61,17 +58,17 @@ impl Default for WeightsAssembler {
 
 impl WeightsAssembler {
     /// Takes the next message; the last of a version gives the weights and the run's configuration (TOML).
-    pub fn push(&mut self, message: WatchWeightsResponse) -> Result<Option<(Weights, String)>, ConvertError> {
-        let part = message.part.ok_or_else(|| ConvertError::missing("part"))?;
+    pub fn push(&mut self, message: WatchWeightsResponse) -> Result<Option<(Weights, String)>, FieldError> {
+        let part = message.part.ok_or_else(|| FieldError::missing("part"))?;
         if part.index == 0 {
             self.run_config_toml = message.run_config_toml;
         }
-        let pushed = self.parts.push(part).map_err(|error| ConvertError::new("part", error.to_string()))?;
+        let pushed = self.parts.push(part).map_err(|error| FieldError::new("part", error.to_string()))?;
         let Some(bytes) = pushed else { return Ok(None) };
         let weights = Weights::new(RunId(message.run_id), WeightsVersion(message.version), bytes);
         if weights.sha256 != message.sha256 {
             let problem = format!("weights of version {} hash to {}", weights.version, weights.sha256);
-            return Err(ConvertError::new("sha256", format!("{} is claimed, the {problem}", message.sha256)));
+            return Err(FieldError::new("sha256", format!("{} is claimed, the {problem}", message.sha256)));
         }
         Ok(Some((weights, std::mem::take(&mut self.run_config_toml))))
     }

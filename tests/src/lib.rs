@@ -36,7 +36,7 @@ pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations:
     let mut config = small(kind, agents, iterations);
     config.task = TaskConfig { horizon: config.task.horizon, ..TaskConfig::of(name, agents, Spawn::Uniform) };
     config.commander.random_assignment_fraction = 0.5;
-    config.resolved().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
+    config.validated().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
 }
 
 /// How a run in this process ended, and the SHA-256 of what it learned.

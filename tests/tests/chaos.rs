@@ -159,7 +159,7 @@ fn it_learns_through_one_actor_crash_every_two_seconds() {
     (config.run.target_success, config.run.eval_every, config.run.eval_episodes) = (0.95, 5, 32);
     // Slow enough to be disturbed on the way.
     config.mappo.actor_learning_rate = 1e-5;
-    let config = config.resolved().unwrap();
+    let config = config.validated().unwrap();
     let calm = tempfile::tempdir().unwrap();
     let expected = train(&config, calm.path(), 1, 1).sha256;
     let mut cluster = Cluster::start_with(&config, Setup { lease: 1.0, ..Setup::default() });

@@ -5,6 +5,7 @@ use magex_commander::service::CommanderConfig;
 use magex_commander::trained::load_scheduler;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
+use magex_core::statics::Statics;
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_proto::convert::encode_result;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
@@ -132,7 +133,7 @@ fn trajectory(run: &Run) -> ShardResult {
         positions: vec![0.5; (t + 1) * b * n * 2],
         velocities: vec![0.25; (t + 1) * b * n * 2],
         agent_state: vec![],
-        landmarks: vec![0.1; b * n * 2],
+        statics: Statics::landmarks(n, 2, vec![0.1; b * n * 2]),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
         log_probs: vec![-1.0; t * b * n],

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex::local::LocalCollector;
-use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::{RunId, Shard};
 use magex_core::metrics_table::{COST_RATIO, SUCCESS_RATE};
 use magex_core::task::TaskName;
@@ -150,7 +150,7 @@ fn the_first_importance_ratio_is_one() {
 
 #[test]
 fn every_scheduler_trains_and_the_learned_ones_change() {
-    for kind in [CommanderKind::Pairwise, CommanderKind::Ranking, CommanderKind::Exact, CommanderKind::Random] {
+    for kind in [CommanderPolicy::Pairwise, CommanderPolicy::Ranking, CommanderPolicy::Exact, CommanderPolicy::Random] {
         let mut config = small(ExecutorKind::Local, 5, 2);
         config.commander.kind = kind;
         let folder = tempfile::tempdir().unwrap();
@@ -161,7 +161,7 @@ fn every_scheduler_trains_and_the_learned_ones_change() {
         let TrainOutcome::Finished(summary) = &ran.outcome else { panic!("{kind}: not finished") };
         let ratio = summary.episodes.greedy[COST_RATIO].unwrap();
         assert!(ratio >= 0.999, "{kind}: better than exact");
-        if kind == CommanderKind::Exact {
+        if kind == CommanderPolicy::Exact {
             assert!((ratio - 1.0).abs() < 1e-6);
         }
         let changed = before.network("commander").unwrap().params != after.network("commander").unwrap().params;

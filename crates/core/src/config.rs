@@ -3,47 +3,49 @@
 //!
 //! Reading is strict: an unknown key or a value out of range is an error that names the field and the remedy.
 
+mod raw;
+
+use crate::error::{FieldError, UnknownName, check_range};
 use crate::task::{Spawn, TaskConfig};
+use raw::RawRunConfig;
 use serde::{Deserialize, Serialize};
+
+pub use raw::RENAMED;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// Not TOML, an unknown key, or a value of the wrong type.
+    /// Not TOML.
     #[error("configuration: {0}")]
     Syntax(String),
-    /// A value out of its range; the message names the field and the remedy.
+    /// A key that does not exist, or a value of the wrong type or out of its range.
     #[error("configuration: {0}")]
-    Range(String),
+    Field(FieldError),
+}
+
+// Not a source: the message holds all of it, and reports that follow the sources would say it twice.
+impl From<FieldError> for ConfigError {
+    fn from(error: FieldError) -> Self {
+        Self::Field(error)
+    }
 }
 
 /// Everything that decides the numbers of a run, and nothing that does not (addresses, thread counts and folders are
-/// options of the commands).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// options of the commands). Every value is given; [`RunConfig::from_toml`] fills in defaults and checks ranges.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunConfig {
     /// Budget, target, evaluation, checkpoints.
-    #[serde(default)]
     pub run: RunSection,
     /// The task.
-    #[serde(default = "default_task")]
     pub task: TaskConfig,
     /// Networks of the action executor.
-    #[serde(default)]
     pub executor: ExecutorConfig,
     /// The goal commander.
-    #[serde(default)]
     pub commander: CommanderConfig,
     /// What an iteration collects.
-    #[serde(default)]
     pub collect: CollectConfig,
     /// The learner's algorithm.
-    #[serde(default)]
     pub mappo: MappoConfig,
-}
-
-fn default_task() -> TaskConfig {
-    TaskConfig::simple_spread(50, Spawn::Lines(None))
 }
 
 /// `[run]`
@@ -101,13 +103,7 @@ pub enum ExecutorKind {
 
 impl std::fmt::Display for ExecutorKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Magex => "magex",
-            Self::MagexLiteral => "magex-literal",
-            Self::Attention => "attention",
-            Self::Mlp => "mlp",
-            Self::Local => "local",
-        })
+        self.serialize(f)
     }
 }
 
@@ -165,7 +161,7 @@ impl Default for ExecutorConfig {
 /// Goal scheduler.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum CommanderKind {
+pub enum CommanderPolicy {
     /// Permutation-equivariant pairwise scorer with sequential masked sampling.
     Pairwise,
     /// The paper's Goal Scheduler: one score per goal, ranked, handed to agents in canonical order.
@@ -176,7 +172,7 @@ pub enum CommanderKind {
     Random,
 }
 
-impl CommanderKind {
+impl CommanderPolicy {
     /// Whether the commander has weights that PPO trains.
     pub fn learned(self) -> bool {
         matches!(self, Self::Pairwise | Self::Ranking)
@@ -188,26 +184,25 @@ impl CommanderKind {
     }
 }
 
-impl std::fmt::Display for CommanderKind {
+impl std::fmt::Display for CommanderPolicy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Pairwise => "pairwise",
-            Self::Ranking => "ranking",
-            Self::Exact => "exact",
-            Self::Random => "random",
-        })
+        self.serialize(f)
     }
 }
 
-impl std::str::FromStr for CommanderKind {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
+impl std::str::FromStr for CommanderPolicy {
+    type Err = UnknownName;
+    fn from_str(text: &str) -> Result<Self, UnknownName> {
         match text {
             "pairwise" => Ok(Self::Pairwise),
             "ranking" => Ok(Self::Ranking),
             "exact" => Ok(Self::Exact),
             "random" => Ok(Self::Random),
-            _ => Err(format!("unknown scheduler '{text}'; use pairwise, ranking, exact or random")),
+            _ => Err(UnknownName {
+                what: "scheduler",
+                name: text.to_owned(),
+                choices: "pairwise, ranking, exact or random",
+            }),
         }
     }
 }
@@ -229,7 +224,7 @@ pub enum CanonicalOrder {
 #[serde(deny_unknown_fields, default)]
 pub struct CommanderConfig {
     /// Goal scheduler.
-    pub kind: CommanderKind,
+    pub kind: CommanderPolicy,
     /// Hidden units per layer of the scheduler's network.
     pub hidden: usize,
     /// Canonical order of the `ranking` scheduler.
@@ -253,7 +248,7 @@ pub struct CommanderConfig {
 impl Default for CommanderConfig {
     fn default() -> Self {
         Self {
-            kind: CommanderKind::Pairwise,
+            kind: CommanderPolicy::Pairwise,
             hidden: 32,
             order: CanonicalOrder::Angle,
             random_assignment_fraction: 0.0,
@@ -268,19 +263,12 @@ impl Default for CommanderConfig {
 }
 
 /// `[collect]`
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CollectConfig {
-    /// Episodes per iteration; 0 means about 200 agents' worth: 40 for N = 5, 12 for N = 20, 4 from N = 50 on.
+    /// Episodes per iteration. Default: about 200 agents' worth, 40 for N = 5, 12 for N = 20, 4 from N = 50 on.
     pub episodes_per_iteration: u32,
     /// S: shards that an iteration's episodes are cut into; must divide `episodes_per_iteration`.
     pub shards_per_iteration: u32,
-}
-
-impl Default for CollectConfig {
-    fn default() -> Self {
-        Self { episodes_per_iteration: 0, shards_per_iteration: 4 }
-    }
 }
 
 /// `[mappo]`
@@ -349,10 +337,10 @@ impl Default for RunConfig {
     fn default() -> Self {
         Self {
             run: RunSection::default(),
-            task: default_task(),
+            task: TaskConfig::simple_spread(50, Spawn::Lines(None)),
             executor: ExecutorConfig::default(),
             commander: CommanderConfig::default(),
-            collect: CollectConfig { episodes_per_iteration: 4, ..CollectConfig::default() },
+            collect: CollectConfig { episodes_per_iteration: 4, shards_per_iteration: 4 },
             mappo: MappoConfig::default(),
         }
     }
@@ -361,17 +349,12 @@ impl Default for RunConfig {
 impl RunConfig {
     /// Reads TOML; missing keys take their defaults; unknown keys and values out of range are errors.
     pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
-        let config: Self = toml::from_str(text).map_err(|e| ConfigError::Syntax(e.to_string().trim().to_owned()))?;
-        config.resolved()
+        RawRunConfig::from_toml(text)?.resolve()?.validated()
     }
 
-    /// Fills in what "0 means default" stands for, and checks every range.
-    pub fn resolved(mut self) -> Result<Self, ConfigError> {
-        self.task = self.task.resolved();
-        if self.collect.episodes_per_iteration == 0 {
-            self.collect.episodes_per_iteration = self.derived_episodes();
-        }
-        self.validate()?;
+    /// The same configuration if every value is in its range.
+    pub fn validated(self) -> Result<Self, ConfigError> {
+        self.check_ranges()?;
         Ok(self)
     }
 
@@ -380,10 +363,9 @@ impl RunConfig {
         toml::to_string(self).map_err(|e| ConfigError::Syntax(e.to_string()))
     }
 
-    /// What `collect.episodes_per_iteration = 0` stands for: about 200 agents' worth, a multiple of the shards.
+    /// Episodes per iteration unless they are chosen: about 200 agents' worth, a multiple of the shards.
     pub fn derived_episodes(&self) -> u32 {
-        let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
-        wanted.next_multiple_of(self.collect.shards_per_iteration.max(1))
+        derived_episodes(self.task.agents, self.collect.shards_per_iteration)
     }
 
     /// Joint environment steps of one iteration.
@@ -396,106 +378,72 @@ impl RunConfig {
         u32::try_from((self.run.max_steps / self.steps_per_iteration().max(1)).max(1)).unwrap_or(u32::MAX)
     }
 
-    fn validate(&self) -> Result<(), ConfigError> {
-        let range = ConfigError::Range;
-        self.task.validate().map_err(range)?;
+    fn check_ranges(&self) -> Result<(), FieldError> {
+        self.task.validate()?;
         let (r, e, c, k, m) = (&self.run, &self.executor, &self.commander, &self.collect, &self.mappo);
-        within("run.seed", r.seed as f64, 0.0, i64::MAX as f64)?;
-        within("run.max_steps", r.max_steps as f64, 1.0, 1e12)?;
-        within("run.target_success", r.target_success.into(), 0.0, 2.0)?;
-        within("run.eval_every", r.eval_every.into(), 1.0, 1e6)?;
-        within("run.eval_episodes", r.eval_episodes.into(), 1.0, 1e5)?;
-        within("run.final_episodes", r.final_episodes.into(), 1.0, 1e5)?;
-        within("run.checkpoint_every", r.checkpoint_every.into(), 1.0, 1e6)?;
-        within("run.keep_checkpoints", r.keep_checkpoints.into(), 2.0, 1e3)?;
-        within("executor.feature_size", e.feature_size as f64, 16.0, 512.0)?;
+        check_range("run.seed", r.seed, 0, i64::MAX as u64)?;
+        check_range("run.max_steps", r.max_steps, 1, 1_000_000_000_000)?;
+        check_range("run.target_success", r.target_success, 0.0, 2.0)?;
+        check_range("run.eval_every", r.eval_every, 1, 1_000_000)?;
+        check_range("run.eval_episodes", r.eval_episodes, 1, 100_000)?;
+        check_range("run.final_episodes", r.final_episodes, 1, 100_000)?;
+        check_range("run.checkpoint_every", r.checkpoint_every, 1, 1_000_000)?;
+        check_range("run.keep_checkpoints", r.keep_checkpoints, 2, 1000)?;
+        check_range("executor.feature_size", e.feature_size, 16, 512)?;
         if e.feature_size % 16 != 0 {
-            return Err(range(format!("executor.feature_size: {} must be a multiple of 16", e.feature_size)));
+            let problem = format!("{} must be a multiple of 16", e.feature_size);
+            return Err(FieldError::new("executor.feature_size", problem));
         }
-        within("executor.graph_blocks", e.graph_blocks as f64, 1.0, 8.0)?;
-        within("executor.pair_hidden", e.pair_hidden as f64, 1.0, 256.0)?;
-        within("executor.temperature", e.temperature.into(), 0.05, 20.0)?;
-        within("executor.hidden", e.hidden as f64, 8.0, 1024.0)?;
-        within("executor.neighbours", e.neighbours as f64, 1.0, 64.0)?;
-        within("commander.hidden", c.hidden as f64, 4.0, 1024.0)?;
-        within("commander.random_assignment_fraction", c.random_assignment_fraction.into(), 0.0, 1.0)?;
-        within("commander.learning_rate", c.learning_rate, 0.0, 1.0)?;
-        within("commander.epochs", c.epochs as f64, 1.0, 100.0)?;
-        within("commander.minibatch", c.minibatch as f64, 1.0, 1e6)?;
-        within("commander.clip", c.clip.into(), 0.001, 10.0)?;
-        within("commander.entropy", c.entropy.into(), 0.0, 10.0)?;
-        within("commander.max_grad_norm", c.max_grad_norm.into(), 1e-6, 1e9)?;
-        within("collect.episodes_per_iteration", k.episodes_per_iteration.into(), 1.0, 1e5)?;
-        within("collect.shards_per_iteration", k.shards_per_iteration.into(), 1.0, k.episodes_per_iteration.into())?;
+        check_range("executor.graph_blocks", e.graph_blocks, 1, 8)?;
+        check_range("executor.pair_hidden", e.pair_hidden, 1, 256)?;
+        check_range("executor.temperature", e.temperature, 0.05, 20.0)?;
+        check_range("executor.hidden", e.hidden, 8, 1024)?;
+        check_range("executor.neighbours", e.neighbours, 1, 64)?;
+        check_range("commander.hidden", c.hidden, 4, 1024)?;
+        check_range("commander.random_assignment_fraction", c.random_assignment_fraction, 0.0, 1.0)?;
+        check_range("commander.learning_rate", c.learning_rate, 0.0, 1.0)?;
+        check_range("commander.epochs", c.epochs, 1, 100)?;
+        check_range("commander.minibatch", c.minibatch, 1, 1_000_000)?;
+        check_range("commander.clip", c.clip, 0.001, 10.0)?;
+        check_range("commander.entropy", c.entropy, 0.0, 10.0)?;
+        check_range("commander.max_grad_norm", c.max_grad_norm, 1e-6, 1e9)?;
+        check_range("collect.episodes_per_iteration", k.episodes_per_iteration, 1, 100_000)?;
+        check_range("collect.shards_per_iteration", k.shards_per_iteration, 1, k.episodes_per_iteration)?;
         if k.episodes_per_iteration % k.shards_per_iteration != 0 {
-            return Err(range(format!(
-                "collect.shards_per_iteration: {} must divide collect.episodes_per_iteration = {}",
+            let problem = format!(
+                "{} must divide collect.episodes_per_iteration = {}",
                 k.shards_per_iteration, k.episodes_per_iteration
-            )));
+            );
+            return Err(FieldError::new("collect.shards_per_iteration", problem));
         }
-        within("mappo.gamma", m.gamma.into(), 0.0, 1.0)?;
-        within("mappo.gae_lambda", m.gae_lambda.into(), 0.0, 1.0)?;
-        within("mappo.epochs", m.epochs.into(), 1.0, 1000.0)?;
-        within("mappo.minibatch_size", m.minibatch_size as f64, 1.0, 1e8)?;
-        within("mappo.chunk_length", m.chunk_length as f64, 1.0, self.task.horizon.into())?;
+        check_range("mappo.gamma", m.gamma, 0.0, 1.0)?;
+        check_range("mappo.gae_lambda", m.gae_lambda, 0.0, 1.0)?;
+        check_range("mappo.epochs", m.epochs, 1, 1000)?;
+        check_range("mappo.minibatch_size", m.minibatch_size, 1, 100_000_000)?;
+        check_range("mappo.chunk_length", m.chunk_length, 1, self.task.horizon as usize)?;
         if e.memory() > 0 && !(self.task.horizon as usize).is_multiple_of(m.chunk_length) {
-            return Err(range(format!(
-                "mappo.chunk_length: {} must divide task.horizon = {}, or chunks would cross episodes",
+            let problem = format!(
+                "{} must divide task.horizon = {}, or chunks would cross episodes",
                 m.chunk_length, self.task.horizon
-            )));
+            );
+            return Err(FieldError::new("mappo.chunk_length", problem));
         }
-        within("mappo.gradient_slices", m.gradient_slices as f64, 1.0, 64.0)?;
-        within("mappo.clip_epsilon", m.clip_epsilon.into(), 0.001, 10.0)?;
-        within("mappo.entropy_coef", m.entropy_coef.into(), 0.0, 10.0)?;
-        within("mappo.huber_delta", m.huber_delta.into(), 1e-3, 1e6)?;
-        within("mappo.actor_learning_rate", m.actor_learning_rate, 0.0, 1.0)?;
-        within("mappo.critic_learning_rate", m.critic_learning_rate, 0.0, 1.0)?;
-        within("mappo.adam_epsilon", m.adam_epsilon, 1e-12, 1.0)?;
-        within("mappo.max_grad_norm", m.max_grad_norm.into(), 1e-6, 1e9)
+        check_range("mappo.gradient_slices", m.gradient_slices, 1, 64)?;
+        check_range("mappo.clip_epsilon", m.clip_epsilon, 0.001, 10.0)?;
+        check_range("mappo.entropy_coef", m.entropy_coef, 0.0, 10.0)?;
+        check_range("mappo.huber_delta", m.huber_delta, 1e-3, 1e6)?;
+        check_range("mappo.actor_learning_rate", m.actor_learning_rate, 0.0, 1.0)?;
+        check_range("mappo.critic_learning_rate", m.critic_learning_rate, 0.0, 1.0)?;
+        check_range("mappo.adam_epsilon", m.adam_epsilon, 1e-12, 1.0)?;
+        check_range("mappo.max_grad_norm", m.max_grad_norm, 1e-6, 1e9)
     }
 }
 
-fn within(field: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
-    if value.is_finite() && (low..=high).contains(&value) {
-        Ok(())
-    } else {
-        Err(ConfigError::Range(format!("{field}: {value} is outside {low}..={high}")))
-    }
+/// See [`RunConfig::derived_episodes`].
+fn derived_episodes(agents: usize, shards: u32) -> u32 {
+    let wanted = (200 / agents.max(1) as u32).clamp(4, 64);
+    wanted.next_multiple_of(shards.max(1))
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_empty_file_is_the_default_run() {
-        let config = RunConfig::from_toml("").unwrap();
-        assert_eq!(config, RunConfig::default());
-        assert_eq!(RunConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
-    }
-
-    #[test]
-    fn unknown_keys_and_bad_values_are_named() {
-        for (text, name) in [
-            ("[mappo]\ngama = 0.9", "gama"),
-            ("[executer]\nkind = 'local'", "executer"),
-            ("[mappo]\ngamma = 1.5", "mappo.gamma"),
-            ("[collect]\nepisodes_per_iteration = 9\nshards_per_iteration = 4", "collect.shards_per_iteration"),
-            ("[mappo]\nchunk_length = 7", "mappo.chunk_length"),
-            ("[executor]\nfeature_size = 20", "executor.feature_size"),
-            ("[run]\nmax_steps = 0", "run.max_steps"),
-            ("[task]\nname = 'simple-spread'\nagents = 0\nspawn = 'lines'", "task.agents"),
-            ("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'ring'", "ring"),
-            ("[commander]\nkind = 'best'", "best"),
-        ] {
-            let error = RunConfig::from_toml(text).unwrap_err().to_string();
-            assert!(error.contains(name), "{text}: {error}");
-        }
-    }
-
-    #[test]
-    fn a_partial_task_takes_the_paper_sizes() {
-        let config = RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'").unwrap();
-        assert_eq!((config.task.side, config.task.horizon), (2.0, 60));
-    }
-}
+mod tests;

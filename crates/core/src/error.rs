@@ -27,3 +27,29 @@ impl FieldError {
         Self { field: format!("{outer}.{}", self.field), problem: self.problem }
     }
 }
+
+/// A name that is none of the known ones.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("unknown {what} '{name}'; use {choices}")]
+pub struct UnknownName {
+    /// What it should name.
+    pub what: &'static str,
+    /// The name given.
+    pub name: String,
+    /// The known names.
+    pub choices: &'static str,
+}
+
+/// `Ok` if the value is a number in `low..=high`.
+pub(crate) fn check_range<T: PartialOrd + std::fmt::Display>(
+    field: impl Into<String>,
+    value: T,
+    low: T,
+    high: T,
+) -> Result<(), FieldError> {
+    if value >= low && value <= high {
+        Ok(())
+    } else {
+        Err(FieldError::new(field, format!("{value} is outside {low}..={high}")))
+    }
+}

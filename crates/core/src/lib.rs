@@ -6,8 +6,13 @@
 pub mod config;
 pub mod error;
 pub mod ids;
+pub mod joint_state;
 pub mod keys;
 pub mod metrics_table;
 pub mod rng;
+pub mod sha256;
+pub mod statics;
 pub mod task;
 pub mod trajectory;
+
+mod toml_table;

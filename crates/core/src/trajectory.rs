@@ -1,7 +1,9 @@
 //! What comes back from a shard: a trajectory to train on, or the metrics of evaluation episodes.
 
+use crate::error::FieldError;
 use crate::ids::Shard;
 use crate::metrics_table::METRICS;
+use crate::statics::Statics;
 use serde::{Deserialize, Serialize};
 use std::ops::{Index, IndexMut};
 
@@ -42,8 +44,8 @@ pub struct Trajectory {
     pub velocities: Vec<f32>,
     /// [T+1, B, N, X] further state of the agents, by task.
     pub agent_state: Vec<f32>,
-    /// [B, G, D] world units.
-    pub landmarks: Vec<f32>,
+    /// [B, ...] the static arrays of the episodes, by name.
+    pub statics: Statics,
     /// [B, N, K] what each agent was assigned: the k-th is an index into the group that the task's k-th stage leads to.
     pub goals: Vec<u32>,
     /// [T, B, N, H] in the agent's own frame, as the policy chose them.
@@ -109,8 +111,8 @@ pub struct Recording {
     pub positions: Vec<f32>,
     /// [T+1, N, X]
     pub agent_state: Vec<f32>,
-    /// [G, D]
-    pub landmarks: Vec<f32>,
+    /// [1, ...] the static arrays of the episode, by name.
+    pub statics: Statics,
     /// [N, K]
     pub goals: Vec<u32>,
 }
@@ -146,17 +148,20 @@ impl ShardResult {
 }
 
 impl Trajectory {
-    /// Checks every array against the shape, every number for finiteness and every index for its range.
-    /// `Err` names the field and the place.
-    pub fn validate(&self) -> Result<(), String> {
+    /// Checks every array against the shape, every number for finiteness and every index for its range. Which static arrays
+    /// there must be only the task knows: see [`Statics::validate`]. An error names the field and the place.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.check().map_err(|error| error.within("trajectory"))
+    }
+
+    fn check(&self) -> Result<(), FieldError> {
         let s = &self.shape;
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
-        let floats: [(&str, &[f32], usize); 9] = [
+        let floats: [(&str, &[f32], usize); 8] = [
             ("positions", &self.positions, state),
             ("velocities", &self.velocities, state),
             ("agent_state", &self.agent_state, (t + 1) * b * n * s.agent_state),
-            ("landmarks", &self.landmarks, b * s.landmarks * s.dims),
             ("log_probs", &self.log_probs, t * b * n),
             ("rewards", &self.rewards, t * b * n),
             ("goal_log_probs", &self.goal_log_probs, b * s.goals_per_agent),
@@ -164,37 +169,30 @@ impl Trajectory {
             ("exact_costs", &self.exact_costs, b * s.goals_per_agent),
         ];
         for (name, data, expected) in floats {
-            if data.len() != expected {
-                return Err(format!("trajectory.{name}: {} numbers, the shape asks for {expected}", data.len()));
-            }
+            check_count(name, "numbers", data.len(), expected)?;
             if let Some(place) = data.iter().position(|x| !x.is_finite()) {
-                return Err(format!("trajectory.{name}[{place}]: {} is not finite", data[place]));
+                return Err(FieldError::new(format!("{name}[{place}]"), format!("{} is not finite", data[place])));
             }
         }
+        self.statics.check_numbers(b)?;
         if let Some(place) = self.log_probs.iter().position(|&x| x > 1e-4) {
-            return Err(format!("trajectory.log_probs[{place}]: {} is above 0", self.log_probs[place]));
+            let problem = format!("{} is above 0", self.log_probs[place]);
+            return Err(FieldError::new(format!("log_probs[{place}]"), problem));
         }
-        if self.goals.len() != b * n * s.goals_per_agent {
-            return Err(format!(
-                "trajectory.goals: {} entries, the shape asks for {}",
-                self.goals.len(),
-                b * n * s.goals_per_agent
-            ));
-        }
+        check_count("goals", "entries", self.goals.len(), b * n * s.goals_per_agent)?;
         let bound = s.landmarks.max(s.bodies) as u32;
         if let Some(place) = self.goals.iter().position(|&g| g >= bound) {
-            return Err(format!("trajectory.goals[{place}]: {} is not below {bound}", self.goals[place]));
+            let problem = format!("{} is not below {bound}", self.goals[place]);
+            return Err(FieldError::new(format!("goals[{place}]"), problem));
         }
-        if self.actions.len() != t * b * n * s.action_components {
-            return Err(format!(
-                "trajectory.actions: {} entries, the shape asks for {}",
-                self.actions.len(),
-                t * b * n * s.action_components
-            ));
-        }
-        if self.metrics.len() != b {
-            return Err(format!("trajectory.metrics: {} entries, the shape asks for {b}", self.metrics.len()));
-        }
-        Ok(())
+        check_count("actions", "entries", self.actions.len(), t * b * n * s.action_components)?;
+        check_count("metrics", "entries", self.metrics.len(), b)
     }
+}
+
+fn check_count(field: &str, what: &str, found: usize, expected: usize) -> Result<(), FieldError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(FieldError::new(field, format!("{found} {what}, the shape asks for {expected}")))
 }

@@ -1,11 +1,15 @@
 //! How fast the environment runs. The only part of the crate that looks at a clock; nothing else depends on it.
 
-use crate::batch::Batch;
-use crate::drones::{Drones, scripted_drones};
-use crate::env::{Env as _, View, new_env};
+use crate::controller::{Controller as _, DroneScript};
+use crate::drones::Drones;
+use crate::env::Env as _;
 use crate::error::EnvError;
-use crate::real::Real;
-use crate::spread::{LANES, Spread};
+use crate::particles::constants::LANES;
+use crate::particles::real::Real;
+use crate::spread::Spread;
+use crate::spread::batch::Batch;
+use crate::tasks::new_env;
+use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{DroneConfig, Spawn, TaskConfig, TaskName};
 use std::time::Instant;
@@ -55,25 +59,26 @@ pub fn drone_throughput(agents: usize, episodes: usize, piloted: bool, seconds: 
     let table: Vec<Vec<u8>> = (0..TABLE).map(|_| (0..3 * numbers).map(|_| stream.below(3) as u8).collect()).collect();
     let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..agents as u32).collect();
     let (mut positions, mut agent_state) = (vec![0.0; 3 * numbers], vec![0.0; DroneConfig::AGENT_STATE * numbers]);
+    let mut pilot = DroneScript::new(agents);
     let (mut actions, mut rewards) = (vec![1; 3 * numbers], vec![0.0; numbers]);
     let (start, mut commands, mut round) = (Instant::now(), 0u64, 0);
     loop {
         let streams = (0..episodes as u32).map(|episode| Key::new(1, Purpose::Bench, &[3, round, episode]).stream());
-        let mut drones = Drones::new(&task, streams)?;
+        let mut drones = Drones::new(&task, streams, false)?;
         drones.set_goals(&goals)?;
-        let landmarks = drones.landmarks().to_vec();
+        let statics = drones.statics().clone();
         for step in 0..task.horizon as usize {
             if piloted {
                 drones.write_positions(&mut positions)?;
                 drones.write_agent_state(&mut agent_state)?;
-                let view = View {
+                let state = JointState {
                     positions: &positions,
                     velocities: &positions,
                     agent_state: &agent_state,
-                    landmarks: &landmarks,
+                    statics: statics.view(),
                     goals: &goals,
                 };
-                scripted_drones(&view, agents, &mut actions)?;
+                pilot.act(&state, &mut actions)?;
             } else {
                 actions.copy_from_slice(&table[step % TABLE]);
             }
@@ -92,12 +97,12 @@ pub fn drone_throughput(agents: usize, episodes: usize, piloted: bool, seconds: 
 pub fn precisions(agents: usize, worlds: usize, seconds: f64) -> Result<[f64; 2], EnvError> {
     let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
     let streams = (0..worlds as u32).map(|world| Key::new(1, Purpose::Bench, &[1, 0, world]).stream());
-    let spread = Spread::new(&task, streams)?;
+    let spread = Spread::new(&task, streams, false)?;
     let (positions, landmarks) = (spread.positions(), spread.landmarks());
     let table = random_actions(agents * worlds, 5);
     Ok([
-        steps_only::<f32>(&task, &positions, landmarks, &table, seconds),
-        steps_only::<f64>(&task, &positions, landmarks, &table, seconds),
+        steps_only::<f32>(&task, &positions, landmarks, &table, seconds)?,
+        steps_only::<f64>(&task, &positions, landmarks, &table, seconds)?,
     ])
 }
 
@@ -107,7 +112,7 @@ fn steps_only<R: Real>(
     landmarks: &[f32],
     table: &[Vec<u8>],
     seconds: f64,
-) -> f64 {
+) -> Result<f64, EnvError> {
     let convert = |values: &[f32]| -> Vec<R> { values.iter().map(|&v| R::from_f64(f64::from(v))).collect() };
     let (positions, landmarks) = (convert(positions), convert(landmarks));
     let velocities = vec![R::ZERO; positions.len()];
@@ -115,13 +120,13 @@ fn steps_only<R: Real>(
     let worlds = positions.len() / (2 * task.agents);
     let (start, mut joint_steps) = (Instant::now(), 0);
     loop {
-        let mut batch = Batch::<R, LANES>::new(task, &positions, &velocities, landmarks.clone(), false);
+        let mut batch = Batch::<R, LANES>::new(task, &positions, &velocities, landmarks.clone(), false)?;
         for (step, actions) in table.iter().enumerate() {
-            batch.step(step as u32 + 1, actions, &mut rewards);
+            batch.advance(step as u32 + 1, actions, &mut rewards);
             joint_steps += worlds;
         }
         if start.elapsed().as_secs_f64() >= seconds {
-            return joint_steps as f64 / start.elapsed().as_secs_f64();
+            return Ok(joint_steps as f64 / start.elapsed().as_secs_f64());
         }
     }
 }

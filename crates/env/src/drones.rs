@@ -7,6 +7,7 @@
 //! The authors' own environment for this task is not published: its physics is (the simulator's), spawn, success radius,
 //! reward and the handling of crashes are this crate's, see [`Drones`].
 
+mod constants;
 pub mod control;
 pub mod model;
 
@@ -15,28 +16,19 @@ pub(crate) mod world;
 
 mod engine;
 mod episode;
-mod script;
 
-pub use script::scripted_drones;
-
-use crate::env::Env;
-use crate::error::{EnvError, check_finite, check_len};
-use crate::spawn::uniform;
+use crate::error::EnvError;
+use crate::particles::placement::uniform;
+use crate::shell::{Moment, Rules, Shell, Starts, Task};
 use episode::Episode;
 use magex_core::rng::Stream;
-use magex_core::task::{DroneConfig, TaskConfig, TaskName};
+use magex_core::statics::LANDMARKS;
+use magex_core::task::{DroneConfig, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use model::{Craft, Effects};
 use world::Laws;
 
-/// Drones start, and landmarks hang, at this height, m.
-pub const HEIGHT: f32 = 1.5;
-/// A landmark is covered when the centre of a drone that has not crashed is within this distance, m.
-pub const COVER_RADIUS: f64 = 0.15;
-/// A command changes the target velocity of an axis by this per second, m/s².
-pub const ACCELERATION: f64 = 5.0;
-/// Largest target velocity, m/s.
-pub const MOST_SPEED: f64 = 2.0;
+pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 
 /// B episodes of N drones and N landmarks, stepped together.
 ///
@@ -62,181 +54,104 @@ pub const MOST_SPEED: f64 = 2.0;
 /// the spawn, a drone 5 mm lower is pushed down with 263 times its weight and is shot into the ground (a test measures
 /// it). So the default bounds the force of one upper drone by m g, its thrust in hover: a wash carries no more momentum
 /// than the thrust that makes it.
-pub struct Drones {
+///
+/// Positions that are given with velocities of more than 2 m/s do not keep them: they are the first target velocities.
+pub type Drones = Shell<DroneTask>;
+
+/// The drone task as the [`Shell`] sees it.
+#[derive(Debug)]
+pub enum DroneTask {}
+
+impl Task for DroneTask {
+    type Rules = Flight;
+
+    fn start(task: &TaskConfig, _: bool, stream: &mut Stream, starts: &mut Starts) -> Result<(), EnvError> {
+        let spacing = f64::from(task.drones()?.spacing);
+        let mut draw = || -> Vec<f32> {
+            let flat = uniform(task.agents, task.side, spacing, stream);
+            flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]).collect()
+        };
+        starts.positions.extend(draw());
+        starts.extend(LANDMARKS, &draw());
+        Ok(())
+    }
+
+    fn rules(task: &TaskConfig, starts: &Starts) -> Result<Box<Flight>, EnvError> {
+        let (n, config) = (3 * task.agents, *task.drones()?);
+        let landmarks = starts.statics.get(LANDMARKS);
+        let effects = Effects { ground: true, drag: true, downwash: true };
+        let dt = 1.0 / f64::from(config.physics_hz);
+        let states = starts.positions.chunks_exact(n).zip(starts.velocities.chunks_exact(n));
+        Ok(Box::new(Flight {
+            laws: Laws::new(Craft::CF2X, effects, config.downwash, dt),
+            config,
+            agents: task.agents,
+            hold: config.physics_hz / DroneConfig::COMMANDS_HZ,
+            episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities)).collect(),
+            landmarks: landmarks.to_vec(),
+        }))
+    }
+}
+
+/// The rules of the drone task.
+pub struct Flight {
     laws: Laws,
     config: DroneConfig,
     agents: usize,
-    horizon: u32,
     /// Physics steps per command.
     hold: u32,
-    steps: u32,
     episodes: Vec<Episode>,
     /// `[B, N, 3]`
     landmarks: Vec<f32>,
-    /// `[B, N]`
-    goals: Vec<u32>,
 }
 
-impl Drones {
-    /// One episode per stream, spawned as the task says. Errors if the task does not validate.
-    pub fn new(task: &TaskConfig, streams: impl Iterator<Item = Stream>) -> Result<Self, EnvError> {
-        check_task(task)?;
-        let spacing = f64::from(task.drones.spacing);
-        let (mut positions, mut landmarks) = (Vec::new(), Vec::new());
-        for mut stream in streams {
-            for points in [&mut positions, &mut landmarks] {
-                let flat = uniform(task.agents, task.side, spacing, &mut stream);
-                points.extend(flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]));
-            }
-        }
-        let velocities = vec![0.0; positions.len()];
-        Ok(Self::assemble(task, &positions, &velocities, landmarks))
-    }
-
-    /// Episodes that start level at given positions with given velocities (of at most 2 m/s to be kept: they are the first
-    /// target velocities), each `[B, N, 3]`.
-    pub fn from_state(
-        task: &TaskConfig,
-        positions: &[f32],
-        velocities: &[f32],
-        landmarks: &[f32],
-    ) -> Result<Self, EnvError> {
-        check_task(task)?;
-        let expected = landmarks.len().next_multiple_of(3 * task.agents);
-        check_len("landmarks", landmarks.len(), expected)?;
-        check_len("positions", positions.len(), expected)?;
-        check_len("velocities", velocities.len(), expected)?;
-        for (field, values) in [("positions", positions), ("velocities", velocities), ("landmarks", landmarks)] {
-            check_finite(field, values)?;
-        }
-        Ok(Self::assemble(task, positions, velocities, landmarks.to_vec()))
-    }
-
-    fn assemble(task: &TaskConfig, positions: &[f32], velocities: &[f32], landmarks: Vec<f32>) -> Self {
-        let n = 3 * task.agents;
-        let effects = Effects { ground: true, drag: true, downwash: true };
-        let dt = 1.0 / f64::from(task.drones.physics_hz);
-        let starts = positions.chunks_exact(n).zip(velocities.chunks_exact(n)).zip(landmarks.chunks_exact(n));
-        Self {
-            laws: Laws::new(Craft::CF2X, effects, task.drones.downwash, dt),
-            config: task.drones,
-            agents: task.agents,
-            horizon: task.horizon,
-            hold: task.drones.physics_hz / DroneConfig::COMMANDS_HZ,
-            steps: 0,
-            episodes: starts.map(|((p, v), landmarks)| Episode::new(p, v, landmarks)).collect(),
-            landmarks,
-            goals: Vec::new(),
-        }
-    }
-
-    /// N.
-    pub fn agents(&self) -> usize {
-        self.agents
-    }
-
-    /// T.
-    pub fn horizon(&self) -> u32 {
-        self.horizon
-    }
-
-    /// `[B, N]` landmark of each drone; empty until they are set.
-    pub fn goals(&self) -> &[u32] {
-        &self.goals
-    }
-
-    /// B · N.
-    fn numbers(&self) -> usize {
-        self.episodes.len() * self.agents
+impl Flight {
+    /// Landmarks [N, 3] of an episode.
+    fn landmarks(&self, episode: usize) -> &[f32] {
+        &self.landmarks[3 * self.agents * episode..3 * self.agents * (episode + 1)]
     }
 }
 
-fn check_task(task: &TaskConfig) -> Result<(), EnvError> {
-    if task.name != TaskName::Drones {
-        return Err(EnvError::Task(format!("task.name: {} is not drones", task.name)));
-    }
-    task.validate().map_err(EnvError::Task)
-}
-
-impl Env for Drones {
-    fn episodes(&self) -> usize {
-        self.episodes.len()
-    }
-
-    fn steps(&self) -> u32 {
-        self.steps
-    }
-
-    fn landmarks(&self) -> &[f32] {
-        &self.landmarks
-    }
-
-    fn write_positions(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("positions", out.len(), 3 * self.numbers())?;
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
-            out.copy_from_slice(&drone.motion.pose.translation.to_array());
-        }
-        Ok(())
-    }
-
-    fn write_velocities(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("velocities", out.len(), 3 * self.numbers())?;
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
-            out.copy_from_slice(&drone.motion.linvel.to_array());
-        }
-        Ok(())
-    }
-
-    fn write_agent_state(&self, out: &mut [f32]) -> Result<(), EnvError> {
-        check_len("agent_state", out.len(), DroneConfig::AGENT_STATE * self.numbers())?;
-        let rows = out.chunks_exact_mut(DroneConfig::AGENT_STATE);
-        for (out, agent_state) in rows.zip(self.episodes.iter().flat_map(Episode::agent_state)) {
-            out.copy_from_slice(&agent_state);
-        }
-        Ok(())
-    }
-
-    fn set_goals(&mut self, goals: &[u32]) -> Result<(), EnvError> {
-        check_len("goals", goals.len(), self.numbers())?;
-        if let Some(place) = goals.iter().position(|&goal| goal as usize >= self.agents) {
-            return Err(EnvError::Goal { place, goal: goals[place], landmarks: self.agents });
-        }
-        self.goals.clear();
-        self.goals.extend_from_slice(goals);
-        Ok(())
-    }
-
-    fn step(&mut self, actions: &[u8], rewards: &mut [f32]) -> Result<(), EnvError> {
-        check_len("actions", actions.len(), 3 * self.numbers())?;
-        check_len("rewards", rewards.len(), self.numbers())?;
-        if self.goals.len() != self.numbers() {
-            return Err(EnvError::GoalsNotSet);
-        }
-        if self.steps >= self.horizon {
-            return Err(EnvError::EpisodeOver { horizon: self.horizon });
-        }
-        if let Some(place) = actions.iter().position(|&action| action > 2) {
-            return Err(EnvError::AxisAction { place, action: actions[place] });
-        }
-        self.steps += 1;
+impl Rules for Flight {
+    fn step(&mut self, step: u32, goals: &[u32], actions: &[u8], rewards: &mut [f32]) {
         let n = self.agents;
-        let inputs =
-            actions.chunks_exact(3 * n).zip(self.goals.chunks_exact(n)).zip(self.landmarks.chunks_exact(3 * n));
+        let inputs = actions.chunks_exact(3 * n).zip(goals.chunks_exact(n)).zip(self.landmarks.chunks_exact(3 * n));
         let outputs = self.episodes.iter_mut().zip(rewards.chunks_exact_mut(n));
         for ((episode, rewards), ((actions, goals), landmarks)) in outputs.zip(inputs) {
             episode.prepare(goals, landmarks);
             episode.fly(&self.laws, self.hold, actions);
             episode.pay(&self.config, goals, landmarks, rewards);
-            episode.observe(self.steps, landmarks);
+            episode.observe(step, landmarks);
         }
-        Ok(())
     }
 
-    fn scores(&self) -> Vec<EpisodeMetrics> {
-        let worlds = self.episodes.iter().zip(self.landmarks.chunks_exact(3 * self.agents));
-        worlds.map(|(episode, landmarks)| episode.score(self.steps, self.horizon, landmarks)).collect()
+    fn write_positions(&self, out: &mut [f32]) {
+        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
+        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+            out.copy_from_slice(&drone.motion.pose.translation.to_array());
+        }
+    }
+
+    fn write_velocities(&self, out: &mut [f32]) {
+        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
+        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+            out.copy_from_slice(&drone.motion.linvel.to_array());
+        }
+    }
+
+    fn write_agent_state(&self, out: &mut [f32]) {
+        let rows = out.chunks_exact_mut(DroneConfig::AGENT_STATE);
+        for (out, agent_state) in rows.zip(self.episodes.iter().flat_map(Episode::agent_state)) {
+            out.copy_from_slice(&agent_state);
+        }
+    }
+
+    fn success(&self, episode: usize) -> f32 {
+        self.episodes[episode].success(self.landmarks(episode))
+    }
+
+    fn score(&self, episode: usize, moment: &Moment<'_>) -> EpisodeMetrics {
+        self.episodes[episode].score(moment, self.landmarks(episode))
     }
 }
 

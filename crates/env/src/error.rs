@@ -1,12 +1,14 @@
 //! What a caller of the environment can get wrong.
 
+use magex_core::error::FieldError;
+
 /// Errors of an [`crate::Env`]. An error leaves the worlds untouched.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EnvError {
     /// The task does not validate; the text names the field and the remedy.
-    #[error("{0}")]
-    Task(String),
+    #[error(transparent)]
+    Task(#[from] FieldError),
     /// An array does not have the length its shape asks for.
     #[error("{field}: {found} entries, the shape asks for {expected}")]
     Length {
@@ -85,14 +87,4 @@ pub(crate) fn check_finite(field: &'static str, values: &[f32]) -> Result<(), En
         None => Ok(()),
         Some(place) => Err(EnvError::NotFinite { field, place, value: values[place] }),
     }
-}
-
-/// `Ok` if every action is one of the five thrusts.
-pub(crate) fn check_actions(actions: &[u8]) -> Result<(), EnvError> {
-    // The maximum first: it vectorises, the search does not.
-    if actions.iter().fold(0, |most, &action| most.max(action)) <= 4 {
-        return Ok(());
-    }
-    let place = actions.iter().position(|&action| action > 4).unwrap_or_default();
-    Err(EnvError::Action { place, action: actions[place] })
 }

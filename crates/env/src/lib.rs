@@ -1,7 +1,8 @@
-//! The particle tasks Simple Spread and Push Ball (paper, section 5.1.1): physics, spawn, reward, metrics, the scripted
-//! controllers used as yardsticks, and the check of all of it against recordings of the authors' simulator.
+//! The tasks: Simple Spread and Push Ball on a particle engine, drones on a rigid-body engine (paper, section 5.1). Physics,
+//! starts, reward, metrics, the scripted controllers used as yardsticks, and the check of all of it against recordings of the
+//! authors' simulators.
 //!
-//! An [`Env`] is a batch of B independent episodes stepped together, one world per SIMD lane. An episode is a pure
+//! An [`Env`] is a batch of B independent episodes stepped together, particle worlds one per SIMD lane. An episode is a pure
 //! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and
 //! on any machine.
 //!
@@ -13,27 +14,25 @@
 )]
 
 pub mod bench;
+pub mod controller;
 pub mod drones;
 pub mod golden;
-pub mod layouts;
+pub mod particles;
 pub mod push_ball;
-pub mod scripted;
-pub mod spawn;
+pub mod shell;
+pub mod spread;
 
-mod arrival;
-mod batch;
-mod cells;
 mod env;
 mod error;
 mod matching;
-mod physics;
-mod real;
-mod spread;
-mod swarm;
+mod tasks;
 
-pub use drones::{Drones, scripted_drones};
-pub use env::{Env, View, new_env};
+pub use controller::Controller;
+pub use drones::Drones;
+pub use env::Env;
 pub use error::EnvError;
+pub use particles::constants::CONTACT_DISTANCE;
+pub use particles::real::Real;
 pub use push_ball::PushBall;
-pub use real::Real;
-pub use spread::{CONTACT_DISTANCE, COVER_RADIUS, Spread};
+pub use spread::{COVER_RADIUS, Spread, layouts, start as spawn};
+pub use tasks::{new_env, scripted};

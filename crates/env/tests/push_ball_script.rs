@@ -8,18 +8,22 @@
 mod assign;
 
 use assign::exact;
+use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, SPAWN_SUCCESS_RATE, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::EpisodeMetrics;
-use magex_env::scripted::scripted_push_ball;
-use magex_env::{Env as _, PushBall, View};
+use magex_env::controller::PushBallScript;
+use magex_env::{Controller as _, Env as _, PushBall};
 
 fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) {
     let n = task.agents;
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
     let mut env = PushBall::new(task, streams, false).unwrap();
-    let landmarks = env.landmarks().to_vec();
+    let statics = env.statics().clone();
+    let landmarks = env.landmarks();
+    let mut script = PushBallScript::new(n);
     let (mut positions, mut velocities) = (env.positions(), env.velocities());
     let mut goals = Vec::new();
     for (bodies, landmarks) in positions.chunks_exact(4 * n).zip(landmarks.chunks_exact(2 * n)) {
@@ -34,14 +38,14 @@ fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) 
     for step in 1..=task.horizon {
         env.write_positions(&mut positions).unwrap();
         env.write_velocities(&mut velocities).unwrap();
-        let view = View {
+        let state = JointState {
             positions: &positions,
             velocities: &velocities,
             agent_state: &[],
-            landmarks: &landmarks,
+            statics: statics.view(),
             goals: &goals,
         };
-        scripted_push_ball(&view, n, &mut actions).unwrap();
+        script.act(&state, &mut actions).unwrap();
         env.step(&actions, &mut rewards).unwrap();
         if solved.is_none() && mean(&env.scores(), |score| score[SUCCESS_RATE]) >= 0.97 {
             solved = Some(step);
@@ -111,20 +115,21 @@ fn the_choice_depends_on_the_state_alone() {
     let mut env = PushBall::new(&task, streams, false).unwrap();
     let goals: Vec<u32> = (0..2).flat_map(|_| (0..5).flat_map(|i| [i, 4 - i])).collect();
     env.set_goals(&goals).unwrap();
-    let landmarks = env.landmarks().to_vec();
+    let statics = env.statics().clone();
+    let mut script = PushBallScript::new(5);
     let (mut positions, mut velocities, mut one_by_one) = (Vec::new(), Vec::new(), Vec::new());
     for _ in 0..3 {
         let (p, v) = (env.positions(), env.velocities());
         let mut actions = vec![0; 10];
         for b in 0..2 {
-            let view = View {
+            let state = JointState {
                 positions: &p[20 * b..20 * b + 20],
                 velocities: &v[20 * b..20 * b + 20],
                 agent_state: &[],
-                landmarks: &landmarks[10 * b..10 * b + 10],
+                statics: statics.episode(b),
                 goals: &goals[10 * b..10 * b + 10],
             };
-            scripted_push_ball(&view, 5, &mut actions[5 * b..5 * b + 5]).unwrap();
+            script.act(&state, &mut actions[5 * b..5 * b + 5]).unwrap();
         }
         env.step(&actions, &mut [0.0; 10]).unwrap();
         positions.extend(p);
@@ -132,26 +137,32 @@ fn the_choice_depends_on_the_state_alone() {
         one_by_one.extend(actions);
     }
     let mut together = vec![9; 30];
-    let view =
-        View { positions: &positions, velocities: &velocities, agent_state: &[], landmarks: &landmarks, goals: &goals };
-    scripted_push_ball(&view, 5, &mut together).unwrap();
+    let state = JointState {
+        positions: &positions,
+        velocities: &velocities,
+        agent_state: &[],
+        statics: statics.view(),
+        goals: &goals,
+    };
+    script.act(&state, &mut together).unwrap();
     assert_eq!(together, one_by_one);
 
     let mut wrong = goals.clone();
     wrong[3] = 5;
-    let error = scripted_push_ball(&View { goals: &wrong, ..view }, 5, &mut together).unwrap_err().to_string();
+    let error = script.act(&JointState { goals: &wrong, ..state }, &mut together).unwrap_err().to_string();
     assert!(error.contains("goals[3]") && error.contains("landmark"), "{error}");
-    for (view, field) in [
-        (View { positions: &positions[1..], ..view }, "positions"),
-        (View { velocities: &velocities[1..], ..view }, "velocities"),
-        (View { landmarks: &landmarks[1..], ..view }, "landmarks"),
-        (View { goals: &goals[1..], ..view }, "goals"),
-        (View { agent_state: &[0.0], ..view }, "agent_state"),
+    let short = Statics::landmarks(5, 2, env.landmarks()[1..].to_vec());
+    for (state, field) in [
+        (JointState { positions: &positions[1..], ..state }, "positions"),
+        (JointState { velocities: &velocities[1..], ..state }, "velocities"),
+        (JointState { statics: short.view(), ..state }, "landmarks"),
+        (JointState { goals: &goals[1..], ..state }, "goals"),
+        (JointState { agent_state: &[0.0], ..state }, "agent_state"),
     ] {
-        let error = scripted_push_ball(&view, 5, &mut together).unwrap_err().to_string();
+        let error = script.act(&state, &mut together).unwrap_err().to_string();
         assert!(error.starts_with(field), "{error}");
     }
-    let view = View { positions: &positions[..40], velocities: &velocities[..40], ..view };
-    assert!(scripted_push_ball(&view, 5, &mut together[..15]).unwrap_err().to_string().starts_with("actions"));
-    assert!(scripted_push_ball(&view, 5, &mut together[..10]).is_ok());
+    let state = JointState { positions: &positions[..40], velocities: &velocities[..40], ..state };
+    assert!(script.act(&state, &mut together[..15]).unwrap_err().to_string().starts_with("actions"));
+    assert!(script.act(&state, &mut together[..10]).is_ok());
 }

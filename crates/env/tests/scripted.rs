@@ -8,13 +8,13 @@
 mod assign;
 
 use assign::exact;
+use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{ARRIVAL_STEP, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
-use magex_env::Env as _;
-use magex_env::Spread;
-use magex_env::scripted::scripted_actions;
+use magex_env::controller::SpreadScript;
+use magex_env::{Controller as _, Env as _, Spread};
 
 fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> {
     let worlds = positions.chunks_exact(2 * agents).zip(landmarks.chunks_exact(2 * agents));
@@ -24,17 +24,25 @@ fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> 
 fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
     let task = TaskConfig::simple_spread(agents, spawn);
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
-    let mut spread = Spread::new(&task, streams).unwrap();
-    let landmarks = spread.landmarks().to_vec();
-    let goals = exact_goals(&spread.positions(), &landmarks, agents);
+    let mut spread = Spread::new(&task, streams, false).unwrap();
+    let statics = spread.statics().clone();
+    let goals = exact_goals(&spread.positions(), spread.landmarks(), agents);
     spread.set_goals(&goals).unwrap();
     let (mut positions, mut velocities) = (spread.positions(), spread.velocities());
     let mut actions = vec![0; goals.len()];
     let mut rewards = vec![0.0; goals.len()];
+    let mut script = SpreadScript::new(agents);
     for _ in 0..task.horizon {
         spread.write_positions(&mut positions).unwrap();
         spread.write_velocities(&mut velocities).unwrap();
-        scripted_actions(&positions, &velocities, &landmarks, &goals, agents, &mut actions).unwrap();
+        let state = JointState {
+            positions: &positions,
+            velocities: &velocities,
+            agent_state: &[],
+            statics: statics.view(),
+            goals: &goals,
+        };
+        script.act(&state, &mut actions).unwrap();
         spread.step(&actions, &mut rewards).unwrap();
     }
     spread.scores()

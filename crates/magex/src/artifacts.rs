@@ -4,21 +4,19 @@ use crate::curve::{curve_svg, parse_metrics};
 use crate::replay::{ReplayEpisode, ReplayInfo, replay_html};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
-use magex_core::task::TaskName;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use std::path::{Path, PathBuf};
 
 /// One line that says what a run is.
 pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
-    let name = match task.name {
-        TaskName::SimpleSpread => "Simple Spread",
-        TaskName::PushBall => "Push Ball",
-        TaskName::Drones => "Drones",
-    };
     format!(
-        "{name}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
-        task.agents, task.spawn, config.executor.kind, config.run.seed
+        "{}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
+        task.title(),
+        task.agents,
+        task.spawn,
+        config.executor.kind,
+        config.run.seed
     )
 }
 

@@ -3,9 +3,8 @@
 use crate::failure::usage;
 use crate::folder::Trained;
 use crate::local::{Crew, commander};
-use crate::settings::resize;
 use magex_actor::rollout::Roller;
-use magex_core::config::{CommanderKind, RunConfig};
+use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
@@ -70,7 +69,7 @@ pub(crate) struct Variation {
     pub(crate) agents: Option<usize>,
     /// Who hands out goals: pairwise, ranking, exact or random.
     #[arg(long, value_name = "KIND")]
-    pub(crate) scheduler: Option<CommanderKind>,
+    pub(crate) scheduler: Option<CommanderPolicy>,
     /// Who drives the agents.
     #[arg(long, value_enum, value_name = "WHO", default_value_t)]
     pub(crate) controller: Controller,
@@ -96,7 +95,7 @@ impl Variation {
             if let Some((part, remedy)) = fixed {
                 return Err(usage(format!("--agents {agents}: {part} of this run was built for {own} agents{remedy}")));
             }
-            resize(&mut config.task, agents);
+            config.task = config.task.resized(agents);
         }
         if let Some(kind) = self.scheduler.filter(|kind| kind.learned() && *kind != config.commander.kind) {
             let own = config.commander.kind;
@@ -108,7 +107,7 @@ impl Variation {
         config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
         // Nothing is learned here; the chunk need not fit the horizon.
         config.mappo.chunk_length = 1;
-        Ok(config.resolved()?)
+        Ok(config.validated()?)
     }
 
     /// Who rolls out.
@@ -121,7 +120,7 @@ impl Variation {
     }
 
     /// The scheduler that hands out goals.
-    pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderKind {
+    pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderPolicy {
         self.scheduler.unwrap_or(config.commander.kind)
     }
 }
@@ -232,9 +231,9 @@ mod tests {
         assert!(error.contains("mlp") && error.contains("50"), "{error}");
         let error = vary.apply(&trained("[commander]\nkind = 'ranking'")).unwrap_err().to_string();
         assert!(error.contains("--scheduler exact"), "{error}");
-        let exact = Variation { scheduler: Some(CommanderKind::Exact), ..vary.clone() };
+        let exact = Variation { scheduler: Some(CommanderPolicy::Exact), ..vary.clone() };
         exact.apply(&trained("[commander]\nkind = 'ranking'")).unwrap();
-        let ranking = Variation { scheduler: Some(CommanderKind::Ranking), ..Variation::default() };
+        let ranking = Variation { scheduler: Some(CommanderPolicy::Ranking), ..Variation::default() };
         assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact or random"));
     }
 }

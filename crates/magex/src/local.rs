@@ -2,7 +2,7 @@
 
 use magex_actor::rollout::Roller;
 use magex_commander::learned::answer;
-use magex_core::config::{CommanderKind, RunConfig};
+use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use magex_learner::collector::Collector;
@@ -29,7 +29,7 @@ pub struct Crew {
 
 impl Crew {
     /// From a weights file; `scheduler` overrides the configured one with a classical one.
-    pub fn new(config: &RunConfig, weights: &[u8], scheduler: Option<CommanderKind>) -> Result<Self, ParamError> {
+    pub fn new(config: &RunConfig, weights: &[u8], scheduler: Option<CommanderPolicy>) -> Result<Self, ParamError> {
         Ok(Self {
             roller: Roller::new(config, weights)?,
             commander: commander(config, weights, scheduler)?,
@@ -70,7 +70,7 @@ impl Crew {
 pub fn commander(
     config: &RunConfig,
     weights: &[u8],
-    scheduler: Option<CommanderKind>,
+    scheduler: Option<CommanderPolicy>,
 ) -> Result<Commander, ParamError> {
     let mut chosen = config.commander.clone();
     if let Some(kind) = scheduler {

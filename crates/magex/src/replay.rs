@@ -95,6 +95,7 @@ pub fn replay_html(info: &ReplayInfo, episodes: &[ReplayEpisode<'_>]) -> Result<
 #[cfg(test)]
 mod tests {
     use super::*;
+    use magex_core::statics::Statics;
     use magex_core::task::{Spawn, TaskName};
     use magex_core::trajectory::Shape;
 
@@ -113,7 +114,7 @@ mod tests {
             },
             positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
             agent_state: vec![],
-            landmarks: vec![0.5, 0.0, 1.0, 0.0],
+            statics: Statics::landmarks(2, 2, vec![0.5, 0.0, 1.0, 0.0]),
             goals: vec![0, 1],
         }
     }
@@ -132,7 +133,7 @@ mod tests {
         let mut recording = recording();
         (recording.shape.dims, recording.shape.agent_state, recording.shape.action_components) = (3, 6, 3);
         recording.positions = (0..12).map(|k| 0.1 * k as f32).collect();
-        recording.landmarks = vec![0.5, 0.0, 1.5, 1.0, 0.0, 1.5];
+        recording.statics = Statics::landmarks(2, 3, vec![0.5, 0.0, 1.5, 1.0, 0.0, 1.5]);
         recording.agent_state = vec![0.0; 24];
         recording.agent_state[0] = -1.5;
         recording.agent_state[23] = 1.0;
@@ -183,7 +184,7 @@ mod tests {
             page("bad", &bad).unwrap_err().to_string()
         };
         assert!(refuse(|r| r.positions[3] = f32::NAN).starts_with("episodes[0].positions: entry 3 is NaN"));
-        assert!(refuse(|r| r.landmarks.truncate(3)).starts_with("episodes[0].landmarks: 3 numbers"));
+        assert!(refuse(|r| r.statics.0[0].values.truncate(3)).starts_with("episodes[0].landmarks: 3 numbers"));
         assert!(refuse(|r| r.goals.push(0)).starts_with("episodes[0].goals: 3 entries"));
         assert!(refuse(|r| r.shape.bodies = 1).starts_with("episodes[0].shape"));
         assert!(refuse(|r| r.goals[1] = 2).ends_with("goals: entry 1 is 2, there are 2 landmarks"));

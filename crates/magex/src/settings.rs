@@ -3,7 +3,7 @@
 use crate::failure::usage;
 use anyhow::Context as _;
 use magex_core::config::{ConfigError, ExecutorKind, RunConfig};
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::Spawn;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
@@ -42,24 +42,13 @@ impl Overrides {
         if let Some(agents) = self.agents {
             // What was derived from the team size is derived anew; what was chosen stays.
             let derived = config.collect.episodes_per_iteration == config.derived_episodes();
-            resize(&mut config.task, agents);
+            config.task = config.task.resized(agents);
             if derived {
-                config.collect.episodes_per_iteration = 0;
+                config.collect.episodes_per_iteration = config.derived_episodes();
             }
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
-        config.resolved()
-    }
-}
-
-/// Changes the team size; what the task derives from it is derived anew.
-pub(crate) fn resize(task: &mut TaskConfig, agents: usize) {
-    if task.agents != agents {
-        let own_unit = task.reward.distance_unit != task.side;
-        (task.agents, task.side, task.horizon, task.layout_scale) = (agents, 0.0, 0, 0.0);
-        if !own_unit {
-            task.reward.distance_unit = 0.0;
-        }
+        config.validated()
     }
 }
 
@@ -125,7 +114,7 @@ mod tests {
     fn another_team_size_brings_its_own_map() {
         let resized = |agents| Overrides { agents: Some(agents), ..Overrides::default() }.apply(RunConfig::default());
         let task = resized(5).unwrap().task;
-        assert_eq!((task.side, task.horizon, task.reward.distance_unit), (2.0, 60, 2.0));
+        assert_eq!((task.side, task.horizon, task.reward().unwrap().distance_unit), (2.0, 60, 2.0));
         assert_eq!(resized(50).unwrap(), RunConfig::default());
         assert!(resized(0).unwrap_err().to_string().contains("task.agents"));
     }

@@ -16,7 +16,7 @@ use crate::params::{Entry, ParamBuilder, ParamError, Params};
 use candle_core::Tensor;
 use magex_assign::random::random;
 use magex_assign::{AssignError, exact_points};
-use magex_core::config::{CommanderConfig, CommanderKind};
+use magex_core::config::{CommanderConfig, CommanderPolicy};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use std::sync::Arc;
@@ -88,7 +88,7 @@ enum Net {
 
 /// A scheduler of any kind.
 pub struct Commander {
-    kind: CommanderKind,
+    kind: CommanderPolicy,
     net: Option<Net>,
 }
 
@@ -107,11 +107,11 @@ impl Commander {
         params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let net = match config.kind {
-            CommanderKind::Pairwise => Some(Net::Pairwise(PairwiseNet::build(config.hidden, params)?)),
-            CommanderKind::Ranking => {
+            CommanderPolicy::Pairwise => Some(Net::Pairwise(PairwiseNet::build(config.hidden, params)?)),
+            CommanderPolicy::Ranking => {
                 Some(Net::Ranking(RankingNet::build(config.hidden, agents, dims, config.order, params)?))
             }
-            CommanderKind::Exact | CommanderKind::Random => None,
+            CommanderPolicy::Exact | CommanderPolicy::Random => None,
         };
         Ok(Self { kind: config.kind, net })
     }
@@ -141,12 +141,12 @@ impl Commander {
     }
 
     /// A scheduler without weights.
-    pub fn classical(kind: CommanderKind) -> Option<Self> {
+    pub fn classical(kind: CommanderPolicy) -> Option<Self> {
         (!kind.learned()).then_some(Self { kind, net: None })
     }
 
     /// Which kind it is.
-    pub fn kind(&self) -> CommanderKind {
+    pub fn kind(&self) -> CommanderPolicy {
         self.kind
     }
 
@@ -161,7 +161,7 @@ impl Commander {
                 let stream = (mode == Mode::Sampled).then_some(stream);
                 Ok(instance.decide(&scores, stream).0)
             }
-            (None, CommanderKind::Random) => Ok(classical(random(n, team.goal_count(), stream)?)),
+            (None, CommanderPolicy::Random) => Ok(classical(random(n, team.goal_count(), stream)?)),
             (None, _) => Ok(classical(exact_points(team.agents, team.goals, team.dims)?.0)),
         }
     }

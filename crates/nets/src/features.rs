@@ -11,25 +11,10 @@ mod neighbours;
 mod push;
 mod symmetry;
 
+use magex_core::joint_state::JointState;
 use magex_core::task::{Frame, Observation, TaskConfig};
 
 pub use symmetry::Symmetry;
-
-/// Joint states to compute features of: S of them, N agents each. Landmarks and goals are those of Q episodes, and state s
-/// belongs to episode s modulo Q.
-#[derive(Debug, Clone, Copy)]
-pub struct JointStates<'a> {
-    /// [S, E, D] world units.
-    pub positions: &'a [f32],
-    /// [S, E, D] world units per second.
-    pub velocities: &'a [f32],
-    /// [S, N, X]
-    pub agent_state: &'a [f32],
-    /// [Q, G, D] world units.
-    pub landmarks: &'a [f32],
-    /// [Q, N, K]; see [`TaskConfig::stages`].
-    pub goals: &'a [u32],
-}
 
 /// What a network wants to see.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -122,9 +107,9 @@ impl FeatureSpec {
     }
 
     /// Features of all agents of all states.
-    pub fn compute(&self, states: &JointStates<'_>) -> Features {
+    pub fn compute(&self, states: &JointState<'_>) -> Features {
         let (n, d, joint) = (self.agents, self.dims, self.bodies() * self.dims);
-        let count = states.positions.len() / joint;
+        let (count, landmarks) = (states.positions.len() / joint, states.landmarks());
         let episodes = states.goals.len() / (n * self.goals_per_agent);
         let mut out = Features::default();
         out.goals.reserve(count * n * self.goal_width());
@@ -143,7 +128,7 @@ impl FeatureSpec {
                 p: &states.positions[s * joint..(s + 1) * joint],
                 v: &states.velocities[s * joint..(s + 1) * joint],
                 agent_state: &states.agent_state[s * n * self.agent_state..(s + 1) * n * self.agent_state],
-                landmarks: &states.landmarks[episode * self.landmarks * d..(episode + 1) * self.landmarks * d],
+                landmarks: &landmarks[episode * self.landmarks * d..(episode + 1) * self.landmarks * d],
                 goals: &states.goals[episode * n * self.goals_per_agent..(episode + 1) * n * self.goals_per_agent],
                 dims: d,
                 agents: n,

@@ -4,11 +4,12 @@
 
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
+use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{Input, build, feature_spec};
-use magex_nets::features::JointStates;
 use magex_nets::ops::{self, Activation, GraphBlock, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params};
 use std::sync::Arc;
@@ -197,7 +198,8 @@ struct States {
     positions: Vec<f32>,
     velocities: Vec<f32>,
     agent_state: Vec<f32>,
-    landmarks: Vec<f32>,
+    /// One episode per state.
+    statics: Statics,
     goals: Vec<u32>,
 }
 
@@ -209,19 +211,19 @@ impl States {
             positions: normal(count * s.bodies * s.dims, 1),
             velocities: normal(count * s.bodies * s.dims, 2),
             agent_state: normal(count * s.agents * s.agent_state, 4).iter().map(|x| -x.abs()).collect(),
-            landmarks: normal(count * s.landmarks * s.dims, 3),
+            statics: Statics::landmarks(s.landmarks, s.dims, normal(count * s.landmarks * s.dims, 3)),
             goals: (0..count).flat_map(goals).collect(),
         }
     }
 
-    fn part(&self, task: &TaskConfig, from: usize, to: usize) -> JointStates<'_> {
+    fn part(&self, task: &TaskConfig, from: usize, to: usize) -> JointState<'_> {
         let s = task.shape(1);
         let state = s.bodies * s.dims;
-        JointStates {
+        JointState {
             positions: &self.positions[from * state..to * state],
             velocities: &self.velocities[from * state..to * state],
             agent_state: &self.agent_state[from * s.agents * s.agent_state..to * s.agents * s.agent_state],
-            landmarks: &self.landmarks[from * s.landmarks * s.dims..to * s.landmarks * s.dims],
+            statics: self.statics.episodes(from..to),
             goals: &self.goals[from * s.agents * s.goals_per_agent..to * s.agents * s.goals_per_agent],
         }
     }

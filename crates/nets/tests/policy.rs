@@ -4,10 +4,12 @@
 use candle_core::{Result, Tensor, Var};
 use magex_core::config::RunConfig;
 use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::joint_state::JointState;
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{Acted, Chooser, Evaluated, Input, Model, Policy};
-use magex_nets::features::{Features, JointStates};
+use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params, to_safetensors};
 
@@ -109,11 +111,12 @@ const STATES: usize = 6;
 
 fn features(model: &Model, task: &TaskConfig) -> Features {
     let s = task.shape(STATES);
-    model.spec().compute(&JointStates {
+    let landmarks = Statics::landmarks(s.landmarks, s.dims, normal(STATES * s.landmarks * s.dims, 3));
+    model.spec().compute(&JointState {
         positions: &normal(STATES * s.bodies * s.dims, 1),
         velocities: &normal(STATES * s.bodies * s.dims, 2),
         agent_state: &[],
-        landmarks: &normal(STATES * s.landmarks * s.dims, 3),
+        statics: landmarks.view(),
         goals: &(0..STATES).flat_map(|_| 0..AGENTS as u32).collect::<Vec<_>>(),
     })
 }

@@ -5,7 +5,8 @@
 //! and knows no task by name; three dimensions are seen from above, from the side and in space.
 
 use magex_core::metrics_table::{METRICS, Metric};
-use magex_core::task::{DroneConfig, Group, TaskConfig, TaskName};
+use magex_core::statics::LANDMARKS;
+use magex_core::task::{Group, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use serde::{Serialize, Serializer};
 
@@ -70,12 +71,7 @@ impl Scene {
     /// The sizes of a task (paper, section 5.1).
     pub fn of(task: &TaskConfig) -> Self {
         let (seen, stages) = (task.observation(), task.stages());
-        let flies = task.name == TaskName::Drones;
-        let (landmark_radius, step_seconds) = match task.name {
-            TaskName::SimpleSpread => (0.05, 0.1),
-            TaskName::PushBall => (0.15, 0.1),
-            TaskName::Drones => (0.03, 1.0 / DroneConfig::COMMANDS_HZ as f32),
-        };
+        let flies = task.dims() == 3;
         Self {
             side: task.side,
             length_unit: if flies { "metres" } else { "world units" },
@@ -83,10 +79,10 @@ impl Scene {
             out_name: "crashed",
             agent_radius: seen.contact_radius / 2.0,
             ball_radius: 0.15,
-            landmark_radius,
+            landmark_radius: task.landmark_radius(),
             contact_distance: seen.contact_radius,
             cover_radius: seen.success_radius,
-            step_seconds,
+            step_seconds: task.step_seconds(),
             ground: flies.then_some(0.0),
             chain: stages.iter().take(1).map(|stage| stage.from).chain(stages.iter().map(|stage| stage.to)).collect(),
             target_velocity: flies.then_some(0),
@@ -127,7 +123,7 @@ impl Scene {
             wide,
             positions: pack(&recording.positions, wide),
             extra_values: pack(&recording.agent_state, wide),
-            landmarks_at: pack(&recording.landmarks, wide),
+            landmarks_at: pack(recording.statics.get(LANDMARKS), wide),
             goals: &recording.goals,
             facts: metrics.map(|metrics| self.facts(metrics)).unwrap_or_default(),
         })
@@ -155,9 +151,9 @@ impl Scene {
             ));
         }
         let floats = [
-            ("positions", &recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
+            ("positions", &*recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
             ("agent_state", &recording.agent_state, (shape.steps + 1) * shape.agents * shape.agent_state),
-            ("landmarks", &recording.landmarks, shape.landmarks * shape.dims),
+            ("landmarks", recording.statics.get(LANDMARKS), shape.landmarks * shape.dims),
         ];
         let mut wide = false;
         for (field, values, expected) in floats {
@@ -271,6 +267,7 @@ mod tests {
     use super::*;
     use magex_core::metrics_table::SECOND_COST_RATIO;
     use magex_core::task::Spawn;
+    use magex_core::task::TaskName;
 
     #[test]
     fn base64_of_the_standard() {

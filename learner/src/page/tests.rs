@@ -3,6 +3,7 @@
 use super::*;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::statics::Statics;
 use magex_core::trajectory::{EvalOutcome, Recording, Shape};
 use magex_proto::v1;
 use magex_runtime::http;
@@ -94,7 +95,7 @@ fn outcome(version: u32, record: bool) -> EvalOutcome {
         shape,
         positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
         agent_state: vec![],
-        landmarks: vec![0.5, 0.0, 1.0, 0.0],
+        statics: Statics::landmarks(2, 2, vec![0.5, 0.0, 1.0, 0.0]),
         goals: vec![0, 1],
     };
     EvalOutcome { shard, metrics: vec![], recording: record.then_some(recording) }

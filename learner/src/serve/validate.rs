@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard};
 use magex_core::metrics_table::METRICS;
+use magex_core::statics::StaticSpec;
 use magex_core::task::TaskConfig;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
@@ -12,6 +13,8 @@ use magex_proto::convert::{ConvertError, Delivery, decode_result};
 pub struct Limits {
     /// Sizes of a result's arrays; `episodes` is the limit per shard.
     pub shape: Shape,
+    /// Static arrays of an episode.
+    pub statics: Vec<StaticSpec>,
     /// Choices of each action component.
     pub action_heads: Vec<usize>,
     /// Whether the task has each of [`METRICS`]; one that it does not have may be absent.
@@ -28,7 +31,7 @@ impl Limits {
         let action_heads = task.action_heads();
         let shape = task.shape(max_episodes);
         let metrics = std::array::from_fn(|row| METRICS[row].applies(task));
-        Self { shape, action_heads, metrics, max_actors: 256, max_watchers: 1024 }
+        Self { shape, statics: task.statics(), action_heads, metrics, max_actors: 256, max_watchers: 1024 }
     }
 
     /// Longest encoded result, bytes: its arrays, and a generous envelope.
@@ -37,7 +40,8 @@ impl Limits {
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
         let agent_state = (t + 1) * b * n * s.agent_state;
-        let floats = 2 * state + agent_state + b * s.landmarks * s.dims + 2 * t * b * n + 3 * b * s.goals_per_agent;
+        let statics: usize = self.statics.iter().map(|spec| spec.shape.iter().product::<usize>()).sum();
+        let floats = 2 * state + agent_state + b * statics + 2 * t * b * n + 3 * b * s.goals_per_agent;
         let metrics = b * METRICS.len();
         let goals = b * n * s.goals_per_agent;
         4 * (floats + metrics + goals) + t * b * n * s.action_components + 64 * 1024
@@ -69,10 +73,8 @@ pub fn validate(limits: &Limits, run_id: &RunId, bytes: Bytes) -> Result<Deliver
 
 fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), ConvertError> {
     check_shape("trajectory.shape", &trajectory.shape, limits, trajectory.shard.episodes as usize)?;
-    trajectory.validate().map_err(|problem| match problem.split_once(": ") {
-        Some((field, problem)) => ConvertError::new(field, problem),
-        None => ConvertError::new("trajectory", problem),
-    })?;
+    trajectory.validate()?;
+    trajectory.statics.validate(&limits.statics, trajectory.shape.episodes).map_err(|e| e.within("trajectory"))?;
     let heads = limits.action_heads.len().max(1);
     for (place, action) in trajectory.actions.iter().enumerate() {
         let choices = limits.action_heads.get(place % heads).copied().unwrap_or(0);
@@ -115,11 +117,8 @@ fn check_eval(limits: &Limits, outcome: &EvalOutcome) -> Result<(), ConvertError
 
 fn check_recording(limits: &Limits, recording: &Recording) -> Result<(), ConvertError> {
     check_shape("eval.recording.shape", &recording.shape, limits, 1)?;
-    for (name, values) in [
-        ("positions", &recording.positions),
-        ("agent_state", &recording.agent_state),
-        ("landmarks", &recording.landmarks),
-    ] {
+    recording.statics.validate(&limits.statics, 1).map_err(|error| error.within("eval.recording"))?;
+    for (name, values) in [("positions", &recording.positions), ("agent_state", &recording.agent_state)] {
         if let Some(place) = values.iter().position(|value| !value.is_finite()) {
             let problem = format!("{} is not finite", values[place]);
             return Err(ConvertError::new(format!("eval.recording.{name}[{place}]"), problem));

@@ -1,11 +1,12 @@
 //! An iteration's trajectories as the update wants them: episode by episode, features computed once.
 
 use candle_core::{Device, Result as CandleResult, Tensor};
+use magex_core::joint_state::JointState;
 use magex_core::keys::episode_keys;
 use magex_core::rng::sequence;
 use magex_core::trajectory::{Shape, Trajectory};
 use magex_nets::executor::Input;
-use magex_nets::features::{FeatureSpec, Features, JointStates};
+use magex_nets::features::{FeatureSpec, Features};
 use magex_nets::ops::GraphNoise;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -168,11 +169,11 @@ fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
         });
         rows.copied().collect()
     };
-    spec.compute(&JointStates {
+    spec.compute(&JointState {
         positions: &episode(&t.positions, s.bodies * s.dims),
         velocities: &episode(&t.velocities, s.bodies * s.dims),
         agent_state: &episode(&t.agent_state, s.agents * s.agent_state),
-        landmarks: &t.landmarks[b * s.landmarks * s.dims..(b + 1) * s.landmarks * s.dims],
+        statics: t.statics.episode(b),
         goals: &t.goals[b * s.agents * s.goals_per_agent..(b + 1) * s.agents * s.goals_per_agent],
     })
 }

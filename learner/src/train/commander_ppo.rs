@@ -13,9 +13,11 @@ use crate::train::learned::{Learned, Network};
 use crate::train::mappo::clipped_surrogate;
 use candle_core::{Tensor, Var};
 use magex_core::config::CommanderConfig;
+use magex_core::joint_state::group_positions;
 use magex_core::keys::random_goals;
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{Group, Stage, TaskConfig};
+use magex_core::statics::LANDMARKS;
+use magex_core::task::{Stage, TaskConfig};
 use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
 use magex_nets::ops::{self, Pick};
@@ -96,7 +98,7 @@ impl CommanderPpo {
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
         for t in trajectories {
-            let stages = self.stages.len();
+            let (stages, points) = (self.stages.len(), (&*t.positions, t.statics.get(LANDMARKS)));
             for b in 0..t.shape.episodes {
                 if random_goals(self.seed, &t.shard, b as u32, self.config.random_assignment_fraction).is_some() {
                     // The scheduler had no say in this episode.
@@ -104,8 +106,8 @@ impl CommanderPpo {
                 }
                 for (k, stage) in self.stages.iter().enumerate() {
                     let team = Team {
-                        agents: start_of(t, stage.from, b),
-                        goals: start_of(t, stage.to, b),
+                        agents: group_positions(&t.shape, points, stage.from, b),
+                        goals: group_positions(&t.shape, points, stage.to, b),
                         dims: t.shape.dims,
                     };
                     let instance = commander.instance(&team)?;
@@ -227,18 +229,6 @@ impl CommanderPpo {
             })
             .collect()
     }
-}
-
-/// Where a group of bodies stands when an episode starts, [N, D].
-fn start_of(t: &Trajectory, group: Group, episode: usize) -> &[f32] {
-    let s = &t.shape;
-    let (points, per_episode, first) = match group {
-        Group::Agents => (&t.positions, s.bodies, 0),
-        Group::Balls => (&t.positions, s.bodies, s.agents),
-        Group::Landmarks => (&t.landmarks, s.landmarks, 0),
-    };
-    let from = (episode * per_episode + first) * s.dims;
-    &points[from..from + s.agents * s.dims]
 }
 
 /// The k-th stage's assignment of an episode, `[N]`, out of the agents' chains of goals; `None` if it is not one-to-one.

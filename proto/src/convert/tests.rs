@@ -54,7 +54,7 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
             shape,
             positions: states.0,
             velocities: states.1,
-            landmarks: states.2,
+            statics: Statics::landmarks(n, d, states.2),
             agent_state: states.3,
             goals: choices.0,
             actions: choices.1,
@@ -89,7 +89,7 @@ proptest! {
     fn an_evaluation_round_trips(shard in shards(), mut metrics in metrics(3), points in floats(3 * 2 * 2)) {
         metrics.truncate(shard.episodes as usize);
         let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, agent_state: 0, goals_per_agent: 1, action_components: 1 };
-        let recording = Recording { shape, landmarks: points[..4].to_vec(), positions: points, agent_state: vec![], goals: vec![1, 0] };
+        let recording = Recording { shape, statics: Statics::landmarks(2, 2, points[..4].to_vec()), positions: points, agent_state: vec![], goals: vec![1, 0] };
         let outcome = ShardResult::Eval(EvalOutcome { shard, metrics, recording: shard.record.then_some(recording) });
         prop_assert_eq!(decode_result(encode_result(&RunId("r".into()), "abc", &outcome)).unwrap().result, outcome);
     }

@@ -2,7 +2,7 @@
 
 use crate::support::{actor_shapes, stream};
 use magex_assign::exact_points;
-use magex_core::config::{CommanderConfig, CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderConfig, CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::train::adam::Adam;
 use magex_learner::train::gae::ValueNorm;
@@ -145,7 +145,7 @@ fn appendix_table_architecture_hyperparameters() {
     assert_eq!(shapes["head.weight"], [32, 5]);
     // f_sche: 4N positions in, N scores out. Deviation: two hidden layers as in the authors' code, where one layer of 4N × N is
     // linear and cannot rank.
-    let kind = CommanderKind::Ranking;
+    let kind = CommanderPolicy::Ranking;
     let params = Commander::start(&CommanderConfig { kind, ..CommanderConfig::default() }, 7, 2, 1).unwrap();
     let weights: Vec<&Vec<usize>> =
         params.entries.iter().map(|entry| &entry.shape).filter(|shape| shape.len() == 2).collect();

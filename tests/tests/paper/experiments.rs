@@ -1,7 +1,7 @@
 //! Section 5: tasks, implementation details, ablations.
 
 use crate::support::{actor_shapes, positions, run, scheduler, stream};
-use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_env::{Env as _, Spread, new_env};
@@ -103,7 +103,7 @@ fn section_5_2_success_is_the_share_of_landmarks_reached_at_the_end_over_100_epi
 fn section_5_5_the_ablations_are_there() {
     let shapes = |kind| actor_shapes(&small(kind, 5, 1));
     // w. RG: goals at random, without replacement.
-    let random = scheduler(CommanderKind::Random, 6);
+    let random = scheduler(CommanderPolicy::Random, 6);
     let points: Vec<f32> = (0..12).map(|k| k as f32).collect();
     let team = Team { agents: &points, goals: &points, dims: 2 };
     let draws: Vec<Vec<u32>> =

@@ -3,7 +3,7 @@
 use crate::support::{act, run, scheduler, scores, stream};
 use candle_core::{Device, Tensor};
 use magex_assign::exact_points;
-use magex_core::config::{CommanderKind, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::Trajectory;
@@ -85,7 +85,7 @@ fn equation_2_a_message_is_the_mean_over_the_neighbours() {
 #[test]
 fn equation_3_goals_are_ranked_by_their_probability_and_handed_out_in_order() {
     let n = 6;
-    let commander = scheduler(CommanderKind::Ranking, n);
+    let commander = scheduler(CommanderPolicy::Ranking, n);
     // Deviation: "agent 1..N" is the order along an axis (or angle, or curve), not the index: with indices in random order one score
     // per goal cannot be learned. Both groups stand in that order here, so index and order agree.
     let agents: Vec<f32> = (0..n).flat_map(|k| [k as f32, 0.3 * (k % 2) as f32]).collect();
@@ -109,8 +109,8 @@ fn equation_3_goals_are_ranked_by_their_probability_and_handed_out_in_order() {
 fn section_4_1_deviation_the_default_scheduler_scores_pairs_and_does_not_depend_on_indices() {
     // One score per goal can only be learned where indices are ordered in space; a score per pair needs no order and serves
     // any number of agents.
-    assert_eq!(RunConfig::default().commander.kind, CommanderKind::Pairwise);
-    let commander = scheduler(CommanderKind::Pairwise, 4);
+    assert_eq!(RunConfig::default().commander.kind, CommanderPolicy::Pairwise);
+    let commander = scheduler(CommanderPolicy::Pairwise, 4);
     let agents = [0.0, 0.0, 3.0, 0.1, 0.2, 4.0, 3.3, 3.7];
     let goals = [3.1, 3.2, 0.4, 0.1, 2.8, 0.3, 0.1, 3.6];
     let decided = |agents: &[f32]| {
@@ -127,7 +127,7 @@ fn section_4_1_deviation_the_default_scheduler_scores_pairs_and_does_not_depend_
 #[test]
 fn equation_4_the_reward_of_the_commander_is_one_minus_the_cost_ratio() {
     // R_c = 1 − C_c / C_h: 0 for the exact assignment, below 0 for any other.
-    for (kind, exact) in [(CommanderKind::Exact, true), (CommanderKind::Random, false)] {
+    for (kind, exact) in [(CommanderPolicy::Exact, true), (CommanderPolicy::Random, false)] {
         let mut config = small(ExecutorKind::Local, 5, 1);
         config.commander.kind = kind;
         let (trajectories, ..) = run(&config);

@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 use magex::local::LocalCollector;
-use magex_core::config::{CanonicalOrder, CommanderConfig, CommanderKind, RunConfig};
+use magex_core::config::{CanonicalOrder, CommanderConfig, CommanderPolicy, RunConfig};
 use magex_core::ids::{RunId, Shard};
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::TaskConfig;
@@ -51,7 +51,7 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
 }
 
 /// A fresh scheduler for N agents in 2-D.
-pub(crate) fn scheduler(kind: CommanderKind, agents: usize) -> Commander {
+pub(crate) fn scheduler(kind: CommanderPolicy, agents: usize) -> Commander {
     let config = CommanderConfig { kind, order: CanonicalOrder::X, ..CommanderConfig::default() };
     let params: Params = Commander::start(&config, agents, 2, 3).unwrap();
     Commander::build(&config, agents, 2, &mut params.source(params.plain().unwrap())).unwrap()

@@ -11,6 +11,7 @@ use magex_commander::service::CommanderConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_learner::collector::Collector;
@@ -82,7 +83,7 @@ pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> Sha
         positions: numbers((t + 1) * b * n * 2),
         velocities: numbers((t + 1) * b * n * 2),
         agent_state: vec![],
-        landmarks: numbers(b * n * 2),
+        statics: Statics::landmarks(n, 2, numbers(b * n * 2)),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
         log_probs: vec![-1.0; t * b * n],

@@ -1,6 +1,9 @@
 //! The drone task as data.
 
-use super::{Observation, Spawn, TaskConfig, coefficients};
+use super::definition::{Definition, coefficients, fits, wrong_task};
+use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
+use crate::error::{FieldError, check_range};
+use crate::toml_table;
 use serde::{Deserialize, Serialize};
 
 /// How a drone's wash presses on the drones below it.
@@ -68,19 +71,46 @@ impl DroneConfig {
     const RATE_LOOP: f32 = 196.0;
 }
 
-pub(super) fn observation() -> Observation {
-    Observation {
+pub(super) const DEFINITION: Definition = Definition {
+    title: "Drones",
+    section: "drones",
+    dims: 3,
+    has_balls: false,
+    agent_state: DroneConfig::AGENT_STATE,
+    crashes: true,
+    action_code: ActionCode::PerAxis,
+    stages: &[Stage { from: Group::Agents, to: Group::Landmarks }],
+    statics: |task| vec![task.landmarks_spec()],
+    observation: Observation {
         sensing_radius: 1.5,
         success_radius: 0.15,
         contact_radius: 0.12,
         encounters: true,
         out: Some(DroneConfig::AGENT_STATE - 1),
-        ..Observation::default()
+        ..Observation::SIMPLE_SPREAD
+    },
+    landmark_radius: 0.03,
+    step_seconds: 1.0 / DroneConfig::COMMANDS_HZ as f32,
+    side: |_| 3.0,
+    horizon: |_, _| 120,
+    layout_scale: |_| 1.0,
+    default_settings: |_| TaskSettings::Drones(DroneConfig::default()),
+    read_settings: |_, section| toml_table::read("task.drones", section).map(TaskSettings::Drones),
+    validate,
+};
+
+impl TaskConfig {
+    /// What only the drones have; an error in any other task.
+    pub fn drones(&self) -> Result<&DroneConfig, FieldError> {
+        match &self.settings {
+            TaskSettings::Drones(settings) => Ok(settings),
+            _ => Err(wrong_task(self, TaskName::Drones)),
+        }
     }
 }
 
-pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
-    let d = &task.drones;
+fn validate(task: &TaskConfig) -> Result<(), FieldError> {
+    let d = task.drones()?;
     coefficients(
         "task.drones",
         &[
@@ -92,29 +122,29 @@ pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
         ],
     )?;
     if task.spawn != Spawn::Uniform {
-        return Err(format!("task.spawn: drones start uniform in the box, not on '{}'; use uniform", task.spawn));
+        let problem = format!("drones start uniform in the box, not on '{}'; use uniform", task.spawn);
+        return Err(FieldError::new("task.spawn", problem));
     }
     if task.layout_scale != 1.0 {
-        return Err(format!(
-            "task.layout_scale: {} has no meaning for drones, who have no layouts; remove it",
-            task.layout_scale
-        ));
+        let problem = format!("{} has no meaning for drones, which have no layouts; remove it", task.layout_scale);
+        return Err(FieldError::new("task.layout_scale", problem));
     }
     let slowest = (DroneConfig::RATE_LOOP / 2.0).ceil() as u32;
     if !(120..=1920).contains(&d.physics_hz) || !d.physics_hz.is_multiple_of(DroneConfig::COMMANDS_HZ) {
-        return Err(format!(
-            "task.drones.physics_hz: {} must be a multiple of {} in 120..=1920; at {slowest} and less the attitude controller \
-             chatters",
+        let problem = format!(
+            "{} must be a multiple of {} in 120..=1920; at {slowest} and less the attitude controller chatters",
             d.physics_hz,
             DroneConfig::COMMANDS_HZ
-        ));
+        );
+        return Err(FieldError::new("task.drones.physics_hz", problem));
     }
     // Closer than a collision radius each, drones would start in contact.
-    if !(d.spacing.is_finite() && (0.13..=10.0).contains(&d.spacing)) {
-        return Err(format!("task.drones.spacing: {} is outside 0.13..=10", d.spacing));
-    }
+    check_range("task.drones.spacing", d.spacing, 0.13, 10.0)?;
     if !(d.proximity_radius.is_finite() && d.proximity_radius > 0.0) {
-        return Err(format!("task.drones.proximity_radius: {} must be positive", d.proximity_radius));
+        return Err(FieldError::new(
+            "task.drones.proximity_radius",
+            format!("{} must be positive", d.proximity_radius),
+        ));
     }
-    task.check_room("drones", task.agents, d.spacing)
+    fits(task, "drones", task.agents, d.spacing)
 }

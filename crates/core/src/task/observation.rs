@@ -33,18 +33,16 @@ pub struct Observation {
     pub out: Option<usize>,
 }
 
-impl Default for Observation {
-    /// Simple Spread.
-    fn default() -> Self {
-        Self {
-            speed: 2.0,
-            fade_radius: 0.3,
-            sensing_radius: 1.0,
-            success_radius: 0.15,
-            contact_radius: 0.2,
-            frame: Frame::World,
-            encounters: false,
-            out: None,
-        }
-    }
+impl Observation {
+    /// The sizes of Simple Spread, from which the other tasks differ in part.
+    pub(super) const SIMPLE_SPREAD: Self = Self {
+        speed: 2.0,
+        fade_radius: 0.3,
+        sensing_radius: 1.0,
+        success_radius: 0.15,
+        contact_radius: 0.2,
+        frame: Frame::World,
+        encounters: false,
+        out: None,
+    };
 }

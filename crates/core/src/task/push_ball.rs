@@ -1,6 +1,9 @@
 //! Push Ball as data.
 
-use super::{Frame, Observation, Spawn, TaskConfig, coefficients};
+use super::definition::{Definition, coefficients, fits, up_to_tens, wrong_task};
+use super::{ActionCode, Frame, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
+use crate::error::{FieldError, check_range};
+use crate::toml_table;
 use serde::{Deserialize, Serialize};
 
 /// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + turn_length · θ ·
@@ -42,19 +45,57 @@ impl Default for PushBallConfig {
 /// Closest that balls, and landmarks, start to one another.
 const SPACING: f32 = 0.3;
 
-pub(super) fn observation() -> Observation {
-    Observation { sensing_radius: 1.5, success_radius: 0.3, frame: Frame::Push, ..Observation::default() }
+pub(super) const DEFINITION: Definition = Definition {
+    title: "Push Ball",
+    section: "push_ball",
+    dims: 2,
+    has_balls: true,
+    agent_state: 0,
+    crashes: false,
+    action_code: ActionCode::Thrust,
+    stages: &[Stage { from: Group::Agents, to: Group::Balls }, Stage { from: Group::Balls, to: Group::Landmarks }],
+    statics: |task| vec![task.landmarks_spec()],
+    observation: Observation {
+        sensing_radius: 1.5,
+        success_radius: 0.3,
+        frame: Frame::Push,
+        ..Observation::SIMPLE_SPREAD
+    },
+    landmark_radius: 0.15,
+    step_seconds: 0.1,
+    side: |agents| match agents {
+        5 => 4.0,
+        20 => 12.0,
+        n => (7.2 * n as f32).sqrt(),
+    },
+    horizon: |agents, side| match agents {
+        5 => 100,
+        20 => 200,
+        _ => up_to_tens(20.0 + 15.0 * side),
+    },
+    layout_scale: |_| 0.5,
+    default_settings: |_| TaskSettings::PushBall(PushBallConfig::default()),
+    read_settings: |_, section| toml_table::read("task.push_ball", section).map(TaskSettings::PushBall),
+    validate,
+};
+
+impl TaskConfig {
+    /// What only Push Ball has; an error in any other task.
+    pub fn push_ball(&self) -> Result<&PushBallConfig, FieldError> {
+        match &self.settings {
+            TaskSettings::PushBall(settings) => Ok(settings),
+            _ => Err(wrong_task(self, TaskName::PushBall)),
+        }
+    }
 }
 
-pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
-    let p = &task.push_ball;
+fn validate(task: &TaskConfig) -> Result<(), FieldError> {
+    let p = task.push_ball()?;
     coefficients(
         "task.push_ball",
         &[("progress", p.progress), ("turn_length", p.turn_length), ("bonus", p.bonus), ("distance", p.distance)],
     )?;
-    if !(0.0..=1.0).contains(&p.start_in_line_fraction) {
-        return Err(format!("task.push_ball.start_in_line_fraction: {} is outside 0..=1", p.start_in_line_fraction));
-    }
+    check_range("task.push_ball.start_in_line_fraction", p.start_in_line_fraction, 0.0, 1.0)?;
     // The balls of the authors' layouts, on their longest line, in raw units apart.
     let gap = match task.agents {
         20 => 6.0 / 19.0,
@@ -63,16 +104,17 @@ pub(super) fn validate(task: &TaskConfig) -> Result<(), String> {
         _ => f32::INFINITY,
     };
     if task.spawn != Spawn::Uniform && gap / task.layout_scale < SPACING {
-        return Err(format!(
-            "task.layout_scale: {} puts the balls of the layouts {:.2} apart, closer than {SPACING}; use at most {:.2}",
+        let problem = format!(
+            "{} puts the balls of the layouts {:.2} apart, closer than {SPACING}; use at most {:.2}",
             task.layout_scale,
             gap / task.layout_scale,
             gap / SPACING
-        ));
+        );
+        return Err(FieldError::new("task.layout_scale", problem));
     }
     if task.spawn == Spawn::Uniform {
         // Agents keep 0.25 from balls and 0.2 from each other: together they need little more room than twice the balls.
-        task.check_room("balls with as many agents", 2 * task.agents, SPACING)?;
+        fits(task, "balls with as many agents", 2 * task.agents, SPACING)?;
     }
     Ok(())
 }

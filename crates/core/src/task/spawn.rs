@@ -1,5 +1,6 @@
 //! Where an episode starts, as data.
 
+use crate::error::UnknownName;
 use serde::{Deserialize, Serialize};
 
 /// Where agents and landmarks start.
@@ -15,10 +16,12 @@ pub enum Spawn {
 }
 
 impl TryFrom<String> for Spawn {
-    type Error = String;
-    fn try_from(text: String) -> Result<Self, String> {
-        let unknown = || {
-            format!("task.spawn: unknown spawn mode '{text}'; use uniform, lines, lines-0..3, authors or authors-0..3")
+    type Error = UnknownName;
+    fn try_from(text: String) -> Result<Self, UnknownName> {
+        let unknown = || UnknownName {
+            what: "spawn mode",
+            name: text.clone(),
+            choices: "uniform, lines, lines-0..3, authors or authors-0..3",
         };
         let layout = |suffix: &str| match suffix {
             "" => Ok(None),
@@ -41,8 +44,8 @@ impl TryFrom<String> for Spawn {
 }
 
 impl std::str::FromStr for Spawn {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
+    type Err = UnknownName;
+    fn from_str(text: &str) -> Result<Self, UnknownName> {
         Self::try_from(text.to_owned())
     }
 }

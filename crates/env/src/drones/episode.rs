@@ -1,12 +1,13 @@
 //! One episode of the drone task: commands, controllers, crashes, reward, score.
 
+use super::constants::{ACCELERATION, COVER_RADIUS, MOST_SPEED};
 use super::control::{Gains, Memory, Request};
 use super::linalg::{V3, norm, scale, sub};
 use super::model::State;
 use super::world::{Drone, Laws, World};
-use super::{ACCELERATION, COVER_RADIUS, MOST_SPEED};
 use crate::env::all_covered;
 use crate::matching::maximum_matching;
+use crate::shell::Moment;
 use magex_core::metrics_table::{
     ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
     SPAWN_SUCCESS_RATE, SUCCESS_RATE,
@@ -25,8 +26,6 @@ pub(super) struct Episode {
     /// Whether each drone was out before the command.
     was_out: Vec<bool>,
     rpm: Vec<[f64; 4]>,
-    /// Share of landmarks covered before the first command.
-    spawn_success: f32,
     /// First command after which the landmarks were covered, 0 while it has not happened.
     arrival: u32,
     /// Sum of the rewards of all drones.
@@ -38,8 +37,8 @@ fn vector(values: &[f32]) -> V3 {
 }
 
 impl Episode {
-    /// Level drones; `positions`, `velocities` and `landmarks` are `[N, 3]`.
-    pub(super) fn new(positions: &[f32], velocities: &[f32], landmarks: &[f32]) -> Self {
+    /// Level drones; `positions` and `velocities` are `[N, 3]`.
+    pub(super) fn new(positions: &[f32], velocities: &[f32]) -> Self {
         let state = |(position, velocity): (&[f32], &[f32])| State {
             position: vector(position),
             attitude: [0.0, 0.0, 0.0, 1.0],
@@ -49,19 +48,21 @@ impl Episode {
         let starts = positions.chunks_exact(3).zip(velocities.chunks_exact(3));
         let drones: Vec<Drone> = starts.map(|start| Drone::at(&state(start))).collect();
         let n = drones.len();
-        let mut episode = Self {
+        Self {
             world: World::new(drones),
             memories: vec![Memory::default(); n],
             targets: velocities.chunks_exact(3).map(|v| limited(vector(v))).collect(),
             before: vec![0.0; n],
             was_out: vec![false; n],
             rpm: vec![[0.0; 4]; n],
-            spawn_success: 0.0,
             arrival: 0,
             reward: 0.0,
-        };
-        episode.spawn_success = share(covered(&episode.near(landmarks)), n);
-        episode
+        }
+    }
+
+    /// Share of the landmarks [N, 3] that are covered now.
+    pub(super) fn success(&self, landmarks: &[f32]) -> f32 {
+        share(covered(&self.near(landmarks)), self.world.drones.len())
     }
 
     /// Distance of a drone to its landmark, m.
@@ -160,19 +161,19 @@ impl Episode {
         })
     }
 
-    /// The score after `steps` commands of an episode of `horizon`.
-    pub(super) fn score(&self, steps: u32, horizon: u32, landmarks: &[f32]) -> EpisodeMetrics {
+    /// The score at a moment.
+    pub(super) fn score(&self, moment: &Moment<'_>, landmarks: &[f32]) -> EpisodeMetrics {
         let n = self.world.drones.len();
         let near = self.near(landmarks);
-        let commands = f64::from(steps.max(1));
+        let commands = f64::from(moment.steps.max(1));
         let crashed = self.world.drones.iter().filter(|drone| drone.is_out()).count() as f64 / n as f64;
         let success = share(covered(&near), n);
         EpisodeMetrics::of([
             (SUCCESS_RATE, success),
             (MATCHED_SUCCESS_RATE, share(maximum_matching(&near, n), n)),
             (ALL_COVERED_RATE, all_covered(success)),
-            (SPAWN_SUCCESS_RATE, self.spawn_success),
-            (ARRIVAL_STEP, if self.arrival > 0 { self.arrival } else { horizon + 1 } as f32),
+            (SPAWN_SUCCESS_RATE, moment.spawn_success),
+            (ARRIVAL_STEP, if self.arrival > 0 { self.arrival } else { moment.horizon + 1 } as f32),
             (COLLISIONS_PER_AGENT_STEP, (crashed / commands) as f32),
             (COLLISION_RATE, crashed as f32),
             (REWARD, (self.reward / (commands * n as f64)) as f32),

@@ -1,12 +1,14 @@
 use super::model::State;
 use super::world::{Crash, Drone, World};
 use super::*;
-use crate::env::View;
+use crate::controller::{Controller as _, DroneScript};
+use crate::env::Env as _;
+use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, MATCHED_SUCCESS_RATE, REWARD, SPAWN_SUCCESS_RATE, SUCCESS_RATE,
 };
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{Downwash, Spawn};
+use magex_core::task::{Downwash, Spawn, TaskName, TaskSettings};
 use proptest::prelude::*;
 use rapier3d::prelude::Vector;
 
@@ -14,6 +16,11 @@ mod collisions;
 
 fn task(agents: usize) -> TaskConfig {
     TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform)
+}
+
+fn set(task: &mut TaskConfig, change: impl FnOnce(&mut DroneConfig)) {
+    let TaskSettings::Drones(settings) = &mut task.settings else { panic!("{task:?}") };
+    change(settings);
 }
 
 fn stream(k: u32) -> Stream {
@@ -53,7 +60,7 @@ impl Seen {
 }
 
 fn step(drones: &mut Drones, actions: &[u8]) -> Seen {
-    let numbers = drones.numbers();
+    let numbers = drones.rows();
     let mut seen = Seen {
         positions: vec![0.0; 3 * numbers],
         velocities: vec![0.0; 3 * numbers],
@@ -68,7 +75,7 @@ fn step(drones: &mut Drones, actions: &[u8]) -> Seen {
 }
 
 fn crash(drones: &Drones, drone: usize) -> Option<Crash> {
-    drones.episodes[0].world.drones[drone].crash
+    drones.rules.episodes[0].world.drones[drone].crash
 }
 
 const STOP: [u8; 3] = [1, 1, 1];
@@ -103,26 +110,27 @@ fn actions_move_the_target_velocity_and_the_drone_follows() {
 
 /// Flies `episodes` random episodes by the scripted pilot; mean success and collision rate.
 fn scripted(task: &TaskConfig, episodes: u32) -> (Drones, [f32; 2]) {
-    let mut drones = Drones::new(task, (0..episodes).map(stream)).unwrap();
+    let mut drones = Drones::new(task, (0..episodes).map(stream), false).unwrap();
     let n = task.agents;
     let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..n as u32).collect();
     drones.set_goals(&goals).unwrap();
-    let numbers = drones.numbers();
-    let landmarks = drones.landmarks().to_vec();
+    let numbers = drones.rows();
+    let statics = drones.statics().clone();
+    let mut script = DroneScript::new(n);
     let (mut positions, mut velocities) = (vec![0.0; 3 * numbers], vec![0.0; 3 * numbers]);
     let (mut agent_state, mut actions) = (vec![0.0; 6 * numbers], vec![1; 3 * numbers]);
     for _ in 0..task.horizon {
         drones.write_positions(&mut positions).unwrap();
         drones.write_velocities(&mut velocities).unwrap();
         drones.write_agent_state(&mut agent_state).unwrap();
-        let view = View {
+        let state = JointState {
             positions: &positions,
             velocities: &velocities,
             agent_state: &agent_state,
-            landmarks: &landmarks,
+            statics: statics.view(),
             goals: &goals,
         };
-        scripted_drones(&view, n, &mut actions).unwrap();
+        script.act(&state, &mut actions).unwrap();
         drones.step(&actions, &mut vec![0.0; numbers]).unwrap();
     }
     let scores = drones.scores();
@@ -137,7 +145,7 @@ fn the_scripted_pilot_arrives_and_alone_never_crashes() {
     for n in [2, 4] {
         let (_, [success, collisions]) = scripted(&task(n), 200);
         println!("N = {n}: success {success}, collisions {collisions}");
-        // It does not look out for others: who does not arrive has crashed, or lost its landmark to a crash.
+        // It ignores other drones: a drone that does not arrive has crashed, or lost its landmark to a crash.
         assert!(success > 0.5 && success + collisions >= 0.95, "{n}: {success} {collisions}");
     }
 }
@@ -150,7 +158,7 @@ fn the_reference_downwash_shoots_down_who_flies_beside() {
     // Side by side at the spawn's least distance, one 5 mm higher.
     let fly = |downwash| {
         let mut task = task(2);
-        task.drones.downwash = downwash;
+        set(&mut task, |d| d.downwash = downwash);
         let mut drones = episode(&task, &[[-0.15, 0.0, 1.5], [0.15, 0.0, 1.505]], &[[0.0; 3]; 2]);
         let fastest = (0..30).map(|_| step(&mut drones, &[1; 6]).velocities[2]).fold(0.0, f32::min);
         println!("{downwash:?}: fastest fall {fastest}, crash {:?}", crash(&drones, 0));
@@ -168,7 +176,7 @@ fn the_reference_downwash_shoots_down_who_flies_beside() {
 fn crashes_are_counted_by_cause() {
     for downwash in [Downwash::Reference, Downwash::Limited, Downwash::Off] {
         let mut task = task(4);
-        task.drones.downwash = downwash;
+        set(&mut task, |d| d.downwash = downwash);
         let (drones, [success, collisions]) = scripted(&task, 200);
         println!("{downwash:?}: success {success}, collisions {collisions}, {:?}", causes(&drones));
         assert!(success > 0.75 && collisions < 0.25, "{downwash:?}");
@@ -179,7 +187,8 @@ fn crashes_are_counted_by_cause() {
 
 fn causes(drones: &Drones) -> std::collections::BTreeMap<String, u32> {
     let mut causes = std::collections::BTreeMap::new();
-    for cause in drones.episodes.iter().flat_map(|episode| &episode.world.drones).filter_map(|drone| drone.crash) {
+    for cause in drones.rules.episodes.iter().flat_map(|episode| &episode.world.drones).filter_map(|drone| drone.crash)
+    {
         *causes.entry(format!("{cause:?}")).or_default() += 1;
     }
     causes
@@ -214,7 +223,7 @@ proptest! {
         let task = task(positions.len());
         let mut lazy = episode(&task, &positions, &velocities);
         let mut always = episode(&task, &positions, &velocities);
-        always.laws.always = true;
+        always.rules.laws.always = true;
         for (k, actions) in actions.iter().enumerate() {
             let (a, b) = (step(&mut lazy, actions), step(&mut always, actions));
             prop_assert!(a.finite() && b.finite());
@@ -239,7 +248,7 @@ fn only_steep_tilts_cost() {
 #[test]
 fn the_reward_is_the_documented_sum() {
     let mut task = task(2);
-    (task.drones.downwash, task.drones.proximity, task.drones.proximity_radius) = (Downwash::Off, 1.0, 0.4);
+    set(&mut task, |d| (d.downwash, d.proximity, d.proximity_radius) = (Downwash::Off, 1.0, 0.4));
     let positions = [[0.0, 0.0, 1.5], [0.3, 0.0, 1.5]];
     let landmarks = [0.0, 0.1, 1.5, 2.0, 0.0, 1.5];
     let mut drones = Drones::from_state(&task, positions.as_flattened(), &[0.0; 6], &landmarks).unwrap();
@@ -276,7 +285,7 @@ fn two_landmarks_beside_one_drone_match_once() {
 fn mistakes_are_named() {
     let task = task(2);
     let text = |result: Result<(), EnvError>| result.unwrap_err().to_string();
-    let mut drones = Drones::new(&task, std::iter::once(stream(1))).unwrap();
+    let mut drones = Drones::new(&task, std::iter::once(stream(1)), false).unwrap();
     assert!(text(drones.step(&[1; 6], &mut [0.0; 2])).contains("set_goals"));
     assert!(text(drones.set_goals(&[0, 2])).contains("goals[1]: 2"));
     assert!(text(drones.set_goals(&[0])).contains("goals: 1 entries"));
@@ -292,22 +301,22 @@ fn mistakes_are_named() {
     assert!(refused(&[0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0]).contains("positions[2]"));
     for (hz, word) in [(100, "multiple"), (90, "chatters"), (30, "chatters"), (1950, "1920")] {
         let mut task = task.clone();
-        task.drones.physics_hz = hz;
-        let error = Drones::new(&task, std::iter::once(stream(1))).err().unwrap().to_string();
+        set(&mut task, |d| d.physics_hz = hz);
+        let error = Drones::new(&task, std::iter::once(stream(1)), false).err().unwrap().to_string();
         assert!(error.contains("task.drones.physics_hz") && error.contains(word), "{error}");
     }
     let mut crowded = task.clone();
-    crowded.drones.spacing = 2.5;
-    assert!(Drones::new(&crowded, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.side"));
+    set(&mut crowded, |d| d.spacing = 2.5);
+    assert!(Drones::new(&crowded, std::iter::once(stream(1)), false).err().unwrap().to_string().contains("task.side"));
     let spread = TaskConfig::simple_spread(2, Spawn::Uniform);
-    assert!(Drones::new(&spread, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.name"));
+    assert!(Drones::new(&spread, std::iter::once(stream(1)), false).err().unwrap().to_string().contains("task.name"));
 }
 
 #[test]
 fn every_physics_rate_that_validates_flies() {
     for hz in [120, 150, 240, 480] {
         let mut task = task(1);
-        task.drones.physics_hz = hz;
+        set(&mut task, |d| d.physics_hz = hz);
         assert_eq!(scripted(&task, 20).1, [1.0, 0.0], "{hz}");
     }
 }
@@ -318,7 +327,7 @@ proptest! {
     #[test]
     fn starts_keep_their_distance_and_stay_in_the_box(n in 1..9usize, k in 0..1000u32) {
         let task = task(n);
-        let drones = Drones::new(&task, std::iter::once(stream(k))).unwrap();
+        let drones = Drones::new(&task, std::iter::once(stream(k)), false).unwrap();
         let mut positions = vec![0.0; 3 * n];
         drones.write_positions(&mut positions).unwrap();
         for points in [&positions[..], drones.landmarks()] {
@@ -331,9 +340,9 @@ proptest! {
     #[test]
     fn an_episode_does_not_see_its_neighbours(k in 0..1000u32, actions in random_actions(6)) {
         let task = task(2);
-        let mut together = Drones::new(&task, (k..k + 3).map(stream)).unwrap();
+        let mut together = Drones::new(&task, (k..k + 3).map(stream), false).unwrap();
         together.set_goals(&[0, 1, 1, 0, 0, 0]).unwrap();
-        let mut alone: Vec<_> = (k..k + 3).map(|k| Drones::new(&task, std::iter::once(stream(k))).unwrap()).collect();
+        let mut alone: Vec<_> = (k..k + 3).map(|k| Drones::new(&task, std::iter::once(stream(k)), false).unwrap()).collect();
         for (drones, goals) in alone.iter_mut().zip([[0, 1], [1, 0], [0, 0]]) {
             drones.set_goals(&goals).unwrap();
         }

@@ -229,7 +229,7 @@ impl World {
                         self.washes.push(laws.wash(drone, other));
                     }
                 }
-                // In an order that does not depend on who is who.
+                // In an order that does not depend on the numbers of the drones.
                 self.washes.sort_unstable_by(f64::total_cmp);
                 wash = self.washes.iter().sum();
             }

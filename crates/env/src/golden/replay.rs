@@ -2,10 +2,10 @@
 
 use super::MpeReport;
 use super::recording::{Body, Frame, Recording, Scenario};
-use crate::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use crate::particles::constants::CONTACT_DISTANCE;
+use crate::particles::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use crate::particles::real::Real;
 use crate::push_ball::{AGENT_RADIUS, BALL_RADIUS};
-use crate::real::Real;
-use crate::spread::CONTACT_DISTANCE;
 
 /// Worlds side by side: the recorded states of as many steps.
 const LANES: usize = 8;

@@ -1,13 +1,21 @@
 //! Push Ball on B worlds, W to a block: goals, reward and bookkeeping.
 
+use super::constants::{AGENT_RADIUS, BALL_RADIUS};
 use super::law::{Law, Legs};
-use super::{AGENT_RADIUS, BALL_RADIUS};
-use crate::arrival::{Arrivals, View};
-use crate::cells::Cells;
-use crate::physics::{AgentsAndBalls, Bodies as _, Physics};
-use crate::real::Real;
-use crate::swarm::Swarm;
+use crate::env::all_covered;
+use crate::particles::arrival::{Arrivals, View};
+use crate::particles::cells::Cells;
+use crate::particles::physics::{AgentsAndBalls, Bodies as _, Physics};
+use crate::particles::real::Real;
+use crate::particles::swarm::Swarm;
+use crate::shell::{Moment, Rules};
+use magex_core::error::FieldError;
+use magex_core::metrics_table::{
+    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
+    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::task::TaskConfig;
+use magex_core::trajectory::EpisodeMetrics;
 
 /// The worlds and what Push Ball makes of them; arrays are laid out like those of [`Swarm`], with N per block where they
 /// belong to agents.
@@ -43,15 +51,15 @@ impl<R: Real, const W: usize> Batch<R, W> {
         velocities: &[R],
         landmarks: Vec<R>,
         with_cells: bool,
-    ) -> Self {
+    ) -> Result<Self, FieldError> {
         let agents = task.agents;
         let kinds = AgentsAndBalls::new(&Physics::standard(), agents, AGENT_RADIUS, BALL_RADIUS);
         let side = f64::from(task.side);
         let swarm = Swarm::new(kinds, (agents, 2 * agents), positions, velocities, with_cells.then_some(side));
         let blocks = swarm.worlds().div_ceil(W);
-        let law = Law::new(&task.push_ball);
+        let law = Law::new(task.push_ball()?);
         let zero = vec![[R::ZERO; W]; blocks * agents];
-        Self {
+        Ok(Self {
             agents,
             ball: vec![[0; W]; blocks * agents],
             lx: zero.clone(),
@@ -65,11 +73,11 @@ impl<R: Real, const W: usize> Batch<R, W> {
             reward_sum: vec![[0.0; W]; blocks],
             hit_sum: vec![[0.0; W]; blocks],
             rewards: vec![[R::ZERO; W]; agents],
-        }
+        })
     }
 
     /// `goals` is `[B, N, 2]`, checked.
-    pub(super) fn set_goals(&mut self, goals: &[u32]) {
+    fn place_goals(&mut self, goals: &[u32]) {
         let n = self.agents;
         for (k, goal) in goals.chunks_exact(2).enumerate() {
             let (world, i) = (k / n, k % n);
@@ -87,7 +95,7 @@ impl<R: Real, const W: usize> Batch<R, W> {
     }
 
     /// One joint step of every world, the `step`-th (from 1). `actions` and `rewards` are `[B, N]`, checked.
-    pub(super) fn step(&mut self, step: u32, actions: &[u8], rewards: &mut [R]) {
+    fn advance(&mut self, step: u32, actions: &[u8], rewards: &mut [R]) {
         let per_block = self.agents * W;
         let blocks = actions.chunks(per_block).zip(rewards.chunks_mut(per_block)).enumerate();
         for (block, (actions, rewards)) in blocks {
@@ -153,36 +161,18 @@ impl<R: Real, const W: usize> Batch<R, W> {
         self.arrivals.observe(block, step, &View { x, y, landmarks, cells: self.cells.as_ref() });
     }
 
-    pub(super) fn worlds(&self) -> usize {
-        self.swarm.worlds()
-    }
-
-    pub(super) fn landmarks(&self) -> &[R] {
-        &self.landmarks
-    }
-
-    /// Writes `[B, 2N, 2]`.
-    pub(super) fn write_positions(&self, out: &mut [R]) {
-        self.swarm.write_positions(out);
-    }
-
-    /// Writes `[B, 2N, 2]`.
-    pub(super) fn write_velocities(&self, out: &mut [R]) {
-        self.swarm.write_velocities(out);
-    }
-
-    /// Step of arrival of a world, if it has arrived.
-    pub(super) fn arrival(&self, world: usize) -> Option<u32> {
-        self.arrivals.step(world)
-    }
-
     /// Sums over agents and steps of a world: rewards, overlaps of agents.
-    pub(super) fn sums(&self, world: usize) -> (f64, f64) {
+    fn sums(&self, world: usize) -> (f64, f64) {
         (self.reward_sum[world / W][world % W], self.hit_sum[world / W][world % W])
     }
 
+    /// A count of landmarks as a share of them.
+    fn share(&self, count: usize) -> f32 {
+        (count as f64 / self.agents as f64) as f32
+    }
+
     /// Landmarks of a world that have any ball within reach.
-    pub(super) fn covered(&self, world: usize) -> usize {
+    fn covered(&self, world: usize) -> usize {
         let n = self.agents;
         let (from, w) = self.swarm.place(world, n);
         let points = |lanes: &[[R; W]]| -> Vec<R> { lanes[from..from + n].iter().map(|lanes| lanes[w]).collect() };
@@ -198,7 +188,7 @@ impl<R: Real, const W: usize> Batch<R, W> {
     }
 
     /// Landmarks of a world whose own ball, by the world's goals `[N, 2]`, is within reach.
-    pub(super) fn matched(&self, world: usize, goals: &[u32]) -> usize {
+    fn matched(&self, world: usize, goals: &[u32]) -> usize {
         let n = self.agents;
         let (from, w) = self.swarm.place(world, n);
         let landmarks = &self.landmarks[2 * world * n..2 * (world + 1) * n];
@@ -215,5 +205,43 @@ impl<R: Real, const W: usize> Batch<R, W> {
     fn reaches(&self, (x, y): (R, R), point: &[R]) -> bool {
         let (dx, dy) = (x - point[0], y - point[1]);
         dx.mul_add(dx, dy * dy) <= self.law.reached2
+    }
+}
+
+impl<const W: usize> Rules for Batch<f32, W> {
+    fn set_goals(&mut self, goals: &[u32]) {
+        self.place_goals(goals);
+    }
+
+    fn step(&mut self, step: u32, _: &[u32], actions: &[u8], rewards: &mut [f32]) {
+        self.advance(step, actions, rewards);
+    }
+
+    fn write_positions(&self, out: &mut [f32]) {
+        self.swarm.write_positions(out);
+    }
+
+    fn write_velocities(&self, out: &mut [f32]) {
+        self.swarm.write_velocities(out);
+    }
+
+    fn success(&self, world: usize) -> f32 {
+        self.share(self.covered(world))
+    }
+
+    fn score(&self, world: usize, moment: &Moment<'_>) -> EpisodeMetrics {
+        let (reward, hits) = self.sums(world);
+        let agent_steps = f64::from(moment.steps.max(1)) * self.agents as f64;
+        let success = self.success(world);
+        EpisodeMetrics::of([
+            (SUCCESS_RATE, success),
+            (MATCHED_SUCCESS_RATE, self.share(self.matched(world, moment.goals))),
+            (ALL_COVERED_RATE, all_covered(success)),
+            (SPAWN_SUCCESS_RATE, moment.spawn_success),
+            (ARRIVAL_STEP, self.arrivals.step(world).unwrap_or(moment.horizon + 1) as f32),
+            (COLLISIONS_PER_AGENT_STEP, (hits / agent_steps) as f32),
+            (COLLISION_RATE, 0.0),
+            (REWARD, (reward / agent_steps) as f32),
+        ])
     }
 }

@@ -1,7 +1,7 @@
 //! What Push Ball pays for.
 
-use crate::push_ball::{PUSH_DISTANCE, REACHED};
-use crate::real::Real;
+use super::constants::{PUSH_DISTANCE, REACHED};
+use crate::particles::real::Real;
 use magex_core::task::PushBallConfig;
 
 /// The coefficients of the reward in the physics' scalar; see [`PushBallConfig`] for the law.

@@ -3,8 +3,8 @@
 //! Agents and landmarks share 2N slots on two lines or circles; N balls stand on one between or across them. There is a
 //! small set (the authors use it for N = 20) and a large one (N = 50).
 
-use super::SPACING;
-use crate::layouts::{Curve, Points};
+use super::constants::SPACING;
+use crate::particles::curves::{Curve, Points};
 use magex_core::task::TaskConfig;
 
 /// Where the agents, the landmarks and the balls of one layout are.

@@ -1,10 +1,11 @@
 //! Where the agents, balls and landmarks of an episode start.
 
+use super::constants::{PUSH_DISTANCE, SPACING};
 use super::layouts::{layout, scale};
-use super::{PUSH_DISTANCE, SPACING};
-use crate::layouts::{Curve, LAYOUTS, Points};
-use crate::spawn::{lattice, near, scatter};
-use crate::spread::CONTACT_DISTANCE;
+use crate::particles::constants::CONTACT_DISTANCE;
+use crate::particles::curves::{Curve, LAYOUTS, Points};
+use crate::particles::placement::{lattice, near, scatter};
+use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::task::{Spawn, TaskConfig};
 
@@ -29,17 +30,19 @@ pub struct Start {
 }
 
 /// Draws the start of an episode from its own stream. What `training` may add is drawn last, so that the same stream
-/// gives an evaluation episode the same start whatever `task.push_ball.start_in_line_fraction` is.
-pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Start {
+/// gives an evaluation episode the same start whatever `task.push_ball.start_in_line_fraction` is. An error if the task is
+/// another one.
+pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Result<Start, FieldError> {
+    let in_line = task.push_ball()?.start_in_line_fraction;
     let mut start = match task.spawn {
         Spawn::Uniform => uniform(task.agents, task.side, stream),
         Spawn::Lines(fixed) => on_layout(task, fixed, JITTER, stream),
         Spawn::Authors(fixed) => on_layout(task, fixed, 0.0, stream),
     };
-    if training && stream.uniform() < f64::from(task.push_ball.start_in_line_fraction) {
+    if training && stream.uniform() < f64::from(in_line) {
         align(&mut start, task.side, stream);
     }
-    start
+    Ok(start)
 }
 
 /// Everything uniform in the centred square. A task that validates has room; if luck runs out all the same, agents and
@@ -59,7 +62,7 @@ fn uniform(n: usize, side: f32, stream: &mut Stream) -> Start {
     Start { agents, balls, landmarks }
 }
 
-/// Balls on their curves and everybody else on the slots, in random order, each moved along its curve by up to `jitter` of
+/// Balls on their curves, agents and landmarks on the slots, in random order, each moved along its curve by up to `jitter` of
 /// the way to a neighbour. A slot that a ball reaches into goes to a landmark.
 fn on_layout(task: &TaskConfig, fixed: Option<u8>, jitter: f64, stream: &mut Stream) -> Start {
     let layout = layout(fixed.unwrap_or_else(|| stream.below(u32::from(LAYOUTS)) as u8), task.agents);

@@ -1,6 +1,11 @@
 use super::*;
+use crate::env::Env as _;
+use magex_core::metrics_table::{
+    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD, SPAWN_SUCCESS_RATE,
+    SUCCESS_RATE,
+};
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{Spawn, TaskName};
+use magex_core::task::{PushBallConfig, Spawn, TaskName, TaskSettings};
 
 fn streams(count: u32) -> impl Iterator<Item = Stream> {
     (0..count).map(|episode| Key::new(3, Purpose::Spawn, &[0, 0, episode]).stream())
@@ -66,7 +71,8 @@ fn the_reward_is_the_documented_one_of_the_step() {
 #[test]
 fn the_authors_reward_is_a_choice_of_coefficients() {
     let mut task = task(2, Spawn::Uniform);
-    (task.push_ball.progress, task.push_ball.bonus, task.push_ball.distance) = (0.0, 1.0, 1.0);
+    let authors = PushBallConfig { progress: 0.0, bonus: 1.0, distance: 1.0, ..PushBallConfig::default() };
+    task.settings = TaskSettings::PushBall(authors);
     let positions = [0.0, 0.0, 3.0, 3.0, 0.0, 1.0, 3.0, 1.0];
     let landmarks = [3.0, 1.2, -1.0, 1.0];
     let mut env = PushBall::from_state(&task, &positions, &[0.0; 8], &landmarks).unwrap();
@@ -133,9 +139,9 @@ fn success_takes_any_ball_and_matched_success_the_own_one() {
     // Ball 0 covers landmark 1, ball 1 landmark 0, ball 2 only just landmark 2; agents 0 and 1 overlap.
     let positions = [3.0, 3.0, 3.1, 3.0, -3.0, -3.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0];
     let landmarks = [0.0, 0.2, 1.0, 0.2, -1.0, -0.3];
-    let start = PushBall::from_state(&task, &positions, &[0.0; 12], &landmarks).unwrap();
+    let start = || PushBall::from_state(&task, &positions, &[0.0; 12], &landmarks).unwrap();
     let play = |goals: &[u32]| {
-        let mut env = start.clone();
+        let mut env = start();
         env.set_goals(goals).unwrap();
         env.step(&[0; 3], &mut [0.0; 3]).unwrap();
         env.scores()[0]
@@ -149,7 +155,7 @@ fn success_takes_any_ball_and_matched_success_the_own_one() {
         );
         assert_eq!((score[ARRIVAL_STEP], score[COLLISION_RATE]), (1.0, 0.0));
     }
-    assert_eq!(start.scores()[0][MATCHED_SUCCESS_RATE], 0.0);
+    assert_eq!(start().scores()[0][MATCHED_SUCCESS_RATE], 0.0);
     let apart = [0.0, 0.2, 1.0, 0.2, -1.0, -0.31];
     let env = PushBall::from_state(&task, &positions, &[0.0; 12], &apart).unwrap();
     assert_eq!((env.scores()[0][SUCCESS_RATE], env.scores()[0][ARRIVAL_STEP]), (2.0 / 3.0, (task.horizon + 1) as f32));
@@ -222,9 +228,9 @@ fn cells_and_lanes_give_the_same_bits() {
         let mut lanes = PushBall::new(&task, streams(1), false).unwrap();
         let (positions, landmarks) = (lanes.positions(), lanes.landmarks().to_vec());
         let rest = vec![0.0; positions.len()];
-        let mut cells = lanes.clone();
-        lanes.worlds = Worlds::Lanes(Batch::new(&task, &positions, &rest, landmarks.clone(), false));
-        cells.worlds = Worlds::Cells(Batch::new(&task, &positions, &rest, landmarks, true));
+        let mut cells = PushBall::new(&task, streams(1), false).unwrap();
+        lanes.rules = Box::new(Batch::<f32, LANES>::new(&task, &positions, &rest, landmarks.clone(), false).unwrap());
+        cells.rules = Box::new(Batch::<f32, 1>::new(&task, &positions, &rest, landmarks, true).unwrap());
         let table = |step, k| action(step, 0, k);
         let goals = own(1, agents);
         assert_eq!(run(&mut lanes, &goals, 0, 60, table), run(&mut cells, &goals, 0, 60, table), "N = {agents}");
@@ -318,7 +324,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 19, .. })));
     assert!(PushBall::from_state(&task, &[0.0; 10], &[0.0; 20], &[0.0; 10]).is_err());
     let mut task = task;
-    task.push_ball.start_in_line_fraction = 1.5;
+    task.settings = TaskSettings::PushBall(PushBallConfig { start_in_line_fraction: 1.5, ..PushBallConfig::default() });
     assert!(
         PushBall::new(&task, streams(1), true)
             .unwrap_err()

@@ -1,6 +1,8 @@
 use super::*;
+use crate::env::Env as _;
+use magex_core::metrics_table::{ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::Spawn;
+use magex_core::task::{RewardConfig, Spawn, TaskSettings};
 
 fn streams(count: u32) -> impl Iterator<Item = Stream> {
     (0..count).map(|episode| Key::new(3, Purpose::Spawn, &[0, 0, episode]).stream())
@@ -14,10 +16,8 @@ fn task(agents: usize) -> TaskConfig {
 fn hand_made() -> (TaskConfig, Spread) {
     let mut task = task(3);
     task.side = 4.0;
-    task.reward.distance_unit = 2.0;
-    task.reward.bonus = 3.0;
-    task.reward.distance = 0.5;
-    task.reward.collision = 0.25;
+    task.settings =
+        TaskSettings::SimpleSpread(RewardConfig { bonus: 3.0, distance: 0.5, collision: 0.25, distance_unit: 2.0 });
     let positions = [0.0, 0.0, 0.125, 0.0, 1.5, 1.5];
     let landmarks = [1.0, 0.0, -1.0, 0.0, 1.5, 1.5];
     let spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
@@ -50,7 +50,7 @@ fn overlapping_agents_pay_for_each_other_and_not_for_themselves() {
     let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &positions).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     let mut rewards = [0.0; 3];
-    // The outer two are pushed out by 0.1, the middle one stays: nobody overlaps any more after the step.
+    // The outer two are pushed out by 0.1, the middle one stays: no two overlap any more after the step.
     spread.step(&[0; 3], &mut rewards).unwrap();
     let after = spread.positions();
     assert!(after[0] < -0.09 && (after[2] - 0.1).abs() < 1e-6 && after[4] > 0.29, "{after:?}");
@@ -116,11 +116,11 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
 fn an_episode_is_the_same_alone_and_in_any_batch() {
     for (agents, episodes) in [(5, 37), (20, 17), (50, 5), (200, 14)] {
         let task = task(agents);
-        let mut together = Spread::new(&task, streams(episodes)).unwrap();
+        let mut together = Spread::new(&task, streams(episodes), false).unwrap();
         let goals: Vec<u32> = (0..episodes).flat_map(|_| (0..agents as u32).rev()).collect();
         together.set_goals(&goals).unwrap();
         let mut alone: Vec<Spread> =
-            streams(episodes).map(|s| Spread::new(&task, std::iter::once(s)).unwrap()).collect();
+            streams(episodes).map(|s| Spread::new(&task, std::iter::once(s), false).unwrap()).collect();
         alone.iter_mut().for_each(|spread| spread.set_goals(&goals[..agents]).unwrap());
         let mut stream = Key::new(3, Purpose::Action, &[agents as u32]).stream();
         let mut rewards = vec![0.0; agents * episodes as usize];
@@ -148,7 +148,7 @@ fn the_numbers_of_an_episode_are_pinned() {
     // Any change here changes every run: raise magex_core::task::TASK_SEMANTICS with it.
     let digest = |agents: usize, spawn: Spawn| {
         let task = TaskConfig::simple_spread(agents, spawn);
-        let mut spread = Spread::new(&task, streams(3)).unwrap();
+        let mut spread = Spread::new(&task, streams(3), false).unwrap();
         spread.set_goals(&(0..3).flat_map(|_| 0..agents as u32).collect::<Vec<_>>()).unwrap();
         let mut stream = Key::new(3, Purpose::Action, &[]).stream();
         let mut rewards = vec![0.0; 3 * agents];
@@ -178,7 +178,7 @@ fn the_numbers_of_an_episode_are_pinned() {
 #[test]
 fn wrong_calls_are_named_and_change_nothing() {
     let task = task(5);
-    let mut spread = Spread::new(&task, streams(2)).unwrap();
+    let mut spread = Spread::new(&task, streams(2), false).unwrap();
     let before = spread.positions();
     let mut rewards = [0.0; 10];
     assert_eq!(spread.step(&[0; 10], &mut rewards), Err(EnvError::GoalsNotSet));
@@ -202,12 +202,12 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 0, .. })));
     let mut task = task;
     task.side = -1.0;
-    assert!(Spread::new(&task, streams(1)).unwrap_err().to_string().contains("task.side"));
+    assert!(Spread::new(&task, streams(1), false).unwrap_err().to_string().contains("task.side"));
 }
 
 #[test]
 fn a_batch_of_nothing_is_fine() {
-    let mut spread = Spread::new(&task(5), streams(0)).unwrap();
+    let mut spread = Spread::new(&task(5), streams(0), false).unwrap();
     spread.set_goals(&[]).unwrap();
     spread.step(&[], &mut []).unwrap();
     assert_eq!((spread.episodes(), spread.positions().len()), (0, 0));

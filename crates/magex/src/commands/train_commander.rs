@@ -10,7 +10,7 @@ use crate::settings;
 use crate::synthetic::Synthetic;
 use anyhow::Context as _;
 use magex_assign::exact_points;
-use magex_core::config::{CommanderKind, RunConfig};
+use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
@@ -78,8 +78,8 @@ const MEASUREMENTS: u32 = 20;
 pub(crate) fn run(args: &TrainCommanderArgs, global: &Global) -> anyhow::Result<u8> {
     let mut config = settings::read(args.config.as_deref())?;
     config.run.seed = args.seed.unwrap_or(config.run.seed);
-    let config = config.resolved()?;
-    if config.commander.kind != CommanderKind::Pairwise {
+    let config = config.validated()?;
+    if config.commander.kind != CommanderPolicy::Pairwise {
         let kind = config.commander.kind;
         return Err(usage(format!("commander.kind: {kind} does not serve teams of every size; use pairwise")));
     }

@@ -1,19 +1,21 @@
 use super::*;
 use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::statics::Statics;
 use magex_core::task::{ActionCode, Spawn, TaskName};
 
 fn spec(neighbours: usize, agents: usize) -> FeatureSpec {
     FeatureSpec::new(&TaskConfig::simple_spread(agents, Spawn::Uniform), true, neighbours, neighbours == 0)
 }
 
-fn spread<'a>(positions: &'a [f32], velocities: &'a [f32], landmarks: &'a [f32], goals: &'a [u32]) -> JointStates<'a> {
-    JointStates { positions, velocities, agent_state: &[], landmarks, goals }
+/// Features of particle states whose episodes have these landmarks.
+fn see(spec: &FeatureSpec, positions: &[f32], velocities: &[f32], landmarks: &[f32], goals: &[u32]) -> Features {
+    let statics = Statics::landmarks(spec.landmarks, 2, landmarks.to_vec());
+    spec.compute(&JointState { positions, velocities, agent_state: &[], statics: statics.view(), goals })
 }
 
 #[test]
 fn goal_features_are_translation_free_and_fade_at_the_goal() {
-    let at =
-        |x: f32, y: f32, gx: f32, gy: f32| spec(0, 1).compute(&spread(&[x, y], &[1.0, 0.0], &[gx, gy], &[0])).goals;
+    let at = |x: f32, y: f32, gx: f32, gy: f32| see(&spec(0, 1), &[x, y], &[1.0, 0.0], &[gx, gy], &[0]).goals;
     assert_eq!(at(0.0, 0.0, 3.0, 4.0), at(1.0, 2.0, 4.0, 6.0));
     assert_eq!(at(0.0, 0.0, 3.0, 4.0), vec![0.5, 0.0, 0.6, 0.8, 0.5, 4.0 / 6.0, 0.0]);
     assert_eq!(at(0.0, 0.0, 0.0, 0.0), vec![0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
@@ -22,7 +24,7 @@ fn goal_features_are_translation_free_and_fade_at_the_goal() {
 #[test]
 fn neighbours_are_the_nearest_within_reach() {
     let positions = [0.0, 0.0, 0.5, 0.0, 0.0, 0.1, 3.0, 0.0, -0.9, 0.0];
-    let features = spec(2, 5).compute(&spread(&positions, &[0.0; 10], &[0.0; 10], &[0; 5]));
+    let features = see(&spec(2, 5), &positions, &[0.0; 10], &[0.0; 10], &[0; 5]);
     assert_eq!(features.counts, [2, 2, 2, 0, 2]);
     assert_eq!(features.neighbours[..10], [0.0, 0.1, 0.0, 0.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.4]);
 }
@@ -33,11 +35,11 @@ fn states_of_an_episode_share_its_landmarks_and_goals() {
     let zero = [0.0; 8];
     // Two states of one episode each, then the same two as one batch of two episodes.
     let spec = spec(0, 2);
-    let first = spec.compute(&spread(&zero[..4], &zero[..4], &landmarks[..4], &[1, 0]));
-    let second = spec.compute(&spread(&zero[..4], &zero[..4], &landmarks[4..], &[0, 1]));
-    let both = spec.compute(&spread(&zero, &zero, &landmarks, &[1, 0, 0, 1]));
+    let first = see(&spec, &zero[..4], &zero[..4], &landmarks[..4], &[1, 0]);
+    let second = see(&spec, &zero[..4], &zero[..4], &landmarks[4..], &[0, 1]);
+    let both = see(&spec, &zero, &zero, &landmarks, &[1, 0, 0, 1]);
     assert_eq!(both.goals, [first.goals.clone(), second.goals].concat());
-    let twice = spec.compute(&spread(&zero, &zero, &landmarks[..4], &[1, 0]));
+    let twice = see(&spec, &zero, &zero, &landmarks[..4], &[1, 0]);
     assert_eq!(twice.goals, [first.goals.clone(), first.goals].concat());
 }
 
@@ -53,7 +55,7 @@ fn push_ball_looks_the_same_from_every_side() {
     let goals = [2, 0, 0, 1, 1, 2];
     for _ in 0..50 {
         let (p, v, l) = (numbers(&mut stream, 12), numbers(&mut stream, 12), numbers(&mut stream, 6));
-        let seen = spec.compute(&spread(&p, &v, &l, &goals));
+        let seen = see(&spec, &p, &v, &l, &goals);
         assert_eq!(seen.goals.len(), 3 * spec.goal_width());
         for turn in 0..8 {
             let map = |points: &[f32]| -> Vec<f32> {
@@ -63,7 +65,7 @@ fn push_ball_looks_the_same_from_every_side() {
                 });
                 turned.collect()
             };
-            let other = spec.compute(&spread(&map(&p), &map(&v), &map(&l), &goals));
+            let other = see(&spec, &map(&p), &map(&v), &map(&l), &goals);
             assert_eq!(other.counts, seen.counts);
             for (a, b) in other.goals.iter().zip(&seen.goals).chain(other.neighbours.iter().zip(&seen.neighbours)) {
                 assert!((a - b).abs() < 1e-5, "turn {turn}: {a} is not {b}");
@@ -88,7 +90,7 @@ fn an_own_ball_is_no_neighbour_and_balls_are_marked() {
     let spec = FeatureSpec::new(&task, true, 3, false);
     let positions = [0.0, 0.0, 1.0, 0.0, 0.3, 0.0, 0.0, 0.4];
     let landmarks = [3.0, 0.0, 0.0, 9.0];
-    let features = spec.compute(&spread(&positions, &[0.0; 8], &landmarks, &[0, 0, 1, 1]));
+    let features = see(&spec, &positions, &[0.0; 8], &landmarks, &[0, 0, 1, 1]);
     // Agent 0 owns the ball at (0.3, 0): it sees the other ball and the other agent.
     assert_eq!(features.counts, [2, 2]);
     let width = spec.neighbour_width();
@@ -97,18 +99,19 @@ fn an_own_ball_is_no_neighbour_and_balls_are_marked() {
 }
 
 #[test]
-fn a_drone_sees_its_closest_approach_and_not_who_is_out() {
+fn a_drone_sees_its_closest_approach_and_no_drone_that_is_out() {
     let task = TaskConfig::of(TaskName::Drones, 3, Spawn::Uniform);
     let spec = FeatureSpec::new(&task, true, 4, true);
     let positions = [0.0, 0.0, 1.5, 1.0, 0.2, 1.5, 0.5, 0.0, 1.5];
     let velocities = [1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
     let mut agent_state = [0.0; 18];
     agent_state[17] = 1.0;
-    let states = JointStates {
+    let landmarks = Statics::landmarks(3, 3, vec![0.0; 9]);
+    let states = JointState {
         positions: &positions,
         velocities: &velocities,
         agent_state: &agent_state,
-        landmarks: &[0.0; 9],
+        statics: landmarks.view(),
         goals: &[0, 1, 2],
     };
     let features = spec.compute(&states);

@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 
 use super::*;
-use magex_core::config::CommanderKind;
+use magex_core::config::CommanderPolicy;
 use magex_core::ids::Mode;
 use magex_core::task::Spawn;
 
@@ -22,7 +22,7 @@ fn lessons(ppo: &CommanderPpo, sizes: &[(usize, usize)]) -> Vec<Lesson> {
     let lesson = |(k, &(n, g)): (usize, &(usize, usize))| {
         let (agents, goals) = points(n, g, k as u32);
         let team = Team { agents: &agents, goals: &goals, dims: 2 };
-        let solver = Commander::classical(CommanderKind::Exact).unwrap();
+        let solver = Commander::classical(CommanderPolicy::Exact).unwrap();
         let exact = solver.assign(&team, Mode::Greedy, &mut Key::new(0, Purpose::Commander, &[]).stream()).unwrap();
         Lesson::new(&commander, &team, &exact.goals).unwrap()
     };

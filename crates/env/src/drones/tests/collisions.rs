@@ -104,9 +104,9 @@ fn rapier_does_not_put_a_hovering_drone_to_sleep() {
     // Beyond rapier's half a second of rest.
     let start = [[0.2, -0.3, 1.5], [0.2, 0.5, 1.5]];
     let mut task = task(2);
-    task.drones.downwash = Downwash::Off;
+    set(&mut task, |d| d.downwash = Downwash::Off);
     let (mut lazy, mut always) = (episode(&task, &start, &[[0.0; 3]; 2]), episode(&task, &start, &[[0.0; 3]; 2]));
-    always.laws.always = true;
+    always.rules.laws.always = true;
     for _ in 0..90 {
         assert_eq!(step(&mut lazy, &[1; 6]).bits(), step(&mut always, &[1; 6]).bits());
     }
@@ -148,7 +148,7 @@ fn a_drone_that_falls_crashes_on_the_ground_and_stays_there() {
         assert_eq!(seen.rewards[0], 0.0);
         assert!(seen.positions[2] > 0.005, "{seen:?}");
     }
-    assert!(drones.episodes[0].world.drones[0].fixed, "{:?}", drones.episodes[0].world.drones[0]);
+    assert!(drones.rules.episodes[0].world.drones[0].fixed, "{:?}", drones.rules.episodes[0].world.drones[0]);
     assert!((seen.positions[2] - 0.0125).abs() < 2e-3 && seen.velocities[2] == 0.0, "{seen:?}");
     assert_eq!(crash(&drones, 1), None);
     let score = drones.scores()[0];
@@ -163,7 +163,7 @@ fn a_crashed_drone_is_still_in_the_way() {
         step(&mut drones, &[1, 1, 2, 1, 1, 1]);
     }
     assert_eq!((crash(&drones, 0), crash(&drones, 1)), (Some(Crash::Ground), None));
-    assert!(drones.episodes[0].world.drones[0].fixed);
+    assert!(drones.rules.episodes[0].world.drones[0].fixed);
     for _ in 0..60 {
         step(&mut drones, &[1, 1, 1, 1, 1, 2]);
     }
@@ -193,15 +193,15 @@ fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
     // The second one is within rapier's reach of the first.
     let positions = [[0.0, 0.0, 1.5], [0.126, 0.0, 1.5], [0.0, 0.6, 1.3]];
     let mut task = task(3);
-    task.drones.downwash = Downwash::Off;
+    set(&mut task, |d| d.downwash = Downwash::Off);
     let mut drones = episode(&task, &positions, &[[0.0; 3]; 3]);
     step(&mut drones, &[1; 9]);
-    let before = drones.episodes[0].world.drones[0].motion.pose;
-    drones.episodes[0].spoil(0);
+    let before = drones.rules.episodes[0].world.drones[0].motion.pose;
+    drones.rules.episodes[0].spoil(0);
     for _ in 0..30 {
         let seen = step(&mut drones, &[1; 9]);
         assert!(seen.finite(), "{seen:?}");
-        assert_eq!(drones.episodes[0].world.drones[0].motion.pose, before);
+        assert_eq!(drones.rules.episodes[0].world.drones[0].motion.pose, before);
     }
     assert_eq!(crash(&drones, 0), Some(Crash::NotFinite));
     assert_eq!((crash(&drones, 1), crash(&drones, 2)), (None, None));

@@ -1,10 +1,14 @@
 use super::*;
 use crate::push_ball::layouts::Layout;
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::TaskName;
+use magex_core::task::{PushBallConfig, TaskName, TaskSettings};
 
 fn stream(k: u32) -> Stream {
     Key::new(5, Purpose::Spawn, &[k]).stream()
+}
+
+fn lined_up(start_in_line_fraction: f32) -> TaskSettings {
+    TaskSettings::PushBall(PushBallConfig { start_in_line_fraction, ..PushBallConfig::default() })
 }
 
 fn task(agents: usize, spawn: Spawn) -> TaskConfig {
@@ -42,7 +46,7 @@ fn uniform_starts_keep_their_distances_and_stay_in_the_box() {
         for task in [task(n, Spawn::Uniform), tight] {
             for k in 0..30 {
                 for training in [false, true] {
-                    let start = spawn(&task, training, &mut stream(k));
+                    let start = spawn(&task, training, &mut stream(k)).unwrap();
                     check_spacings(&start, n, &format!("N = {n}, side {}", task.side));
                     assert!(closest(&start.landmarks, &start.landmarks) >= 0.3 - 1e-5);
                     let all = [&start.agents[..], &start.balls, &start.landmarks].concat();
@@ -87,7 +91,7 @@ fn points_on_the_lines_keep_their_distances_and_lie_on_them() {
                 let task = task(n, mode);
                 let Layout { slots, balls } = layout(index, n);
                 for k in 0..40 {
-                    let start = spawn(&task, false, &mut stream(k));
+                    let start = spawn(&task, false, &mut stream(k)).unwrap();
                     check_spacings(&start, n, &format!("N = {n}, {mode}"));
                     let scale = scale(&task);
                     let (points, curves) = ([&start.agents[..], &start.landmarks].concat(), &slots);
@@ -114,7 +118,7 @@ fn the_authors_points_are_even_and_split_at_random() {
                 points.flatten().map(|c| c as f32).collect()
             };
             let layout = layout(index, n);
-            let start = |k| spawn(&task, false, &mut stream(k));
+            let start = |k| spawn(&task, false, &mut stream(k)).unwrap();
             let (one, two) = (start(1), start(2));
             for start in [&one, &two] {
                 let slots = [&start.agents[..], &start.landmarks].concat();
@@ -126,7 +130,7 @@ fn the_authors_points_are_even_and_split_at_random() {
         }
     }
     // Agents exactly above or below balls: the starts that training prepares for.
-    let start = spawn(&task(20, Spawn::Authors(Some(0))), false, &mut stream(1));
+    let start = spawn(&task(20, Spawn::Authors(Some(0))), false, &mut stream(1)).unwrap();
     let below = |agent: &[f32]| start.balls.chunks_exact(2).any(|ball| ball[0] == agent[0]);
     assert!(start.agents.chunks_exact(2).all(below));
 }
@@ -138,7 +142,7 @@ fn jittered_points_use_their_room() {
     let most = (0.5f64 * (gap - 0.3)).min(0.3 * gap);
     let (mut furthest, mut sum) = (0.0f64, 0.0);
     for k in 0..200 {
-        for x in spawn(&task, false, &mut stream(k)).balls.iter().step_by(2) {
+        for x in spawn(&task, false, &mut stream(k)).unwrap().balls.iter().step_by(2) {
             let place = (f64::from(*x) + 6.0) / gap;
             let moved = gap * (place - place.round()).abs();
             furthest = furthest.max(moved);
@@ -164,11 +168,11 @@ fn training_puts_agents_in_the_way_of_their_balls_as_often_as_asked() {
     for mode in [Spawn::Uniform, Spawn::Lines(None)] {
         for aligned in [0.0, 0.3, 1.0] {
             let mut task = task(if mode == Spawn::Uniform { 5 } else { 20 }, mode);
-            task.push_ball.start_in_line_fraction = aligned;
+            task.settings = lined_up(aligned);
             let (mut episodes, mut agents) = (0, 0);
             for k in 0..1000 {
-                let plain = spawn(&task, false, &mut stream(k));
-                let start = spawn(&task, true, &mut stream(k));
+                let plain = spawn(&task, false, &mut stream(k)).unwrap();
+                let start = spawn(&task, true, &mut stream(k)).unwrap();
                 assert_eq!(plain.balls, start.balls);
                 check_spacings(&start, task.agents, "in line");
                 let changed = plain != start;
@@ -187,9 +191,9 @@ fn evaluation_starts_ignore_what_is_for_training() {
     for mode in [Spawn::Uniform, Spawn::Lines(None), Spawn::Authors(None)] {
         let plain = task(20, mode);
         let mut other = plain.clone();
-        other.push_ball.start_in_line_fraction = 1.0;
+        other.settings = lined_up(1.0);
         for k in 0..20 {
-            assert_eq!(spawn(&plain, false, &mut stream(k)), spawn(&other, false, &mut stream(k)));
+            assert_eq!(spawn(&plain, false, &mut stream(k)).unwrap(), spawn(&other, false, &mut stream(k)).unwrap());
         }
     }
 }
@@ -198,9 +202,12 @@ fn evaluation_starts_ignore_what_is_for_training() {
 fn a_start_depends_on_its_stream_alone() {
     for mode in [Spawn::Uniform, Spawn::Lines(None), Spawn::Authors(None)] {
         let task = task(20, mode);
-        assert_eq!(spawn(&task, true, &mut stream(3)), spawn(&task, true, &mut stream(3)));
+        assert_eq!(spawn(&task, true, &mut stream(3)).unwrap(), spawn(&task, true, &mut stream(3)).unwrap());
         assert!(
-            (0..40).filter(|&k| spawn(&task, true, &mut stream(k)) != spawn(&task, true, &mut stream(3))).count() == 39
+            (0..40)
+                .filter(|&k| spawn(&task, true, &mut stream(k)).unwrap() != spawn(&task, true, &mut stream(3)).unwrap())
+                .count()
+                == 39
         );
     }
 }

@@ -13,7 +13,7 @@ use anyhow::Context as _;
 use load::{Flood, flood, one_client, saturate};
 use magex_assign::bench::{time_exact, uniform_points};
 use magex_assign::distances;
-use magex_core::config::{CommanderConfig, CommanderKind, RunConfig};
+use magex_core::config::{CommanderConfig, CommanderPolicy, RunConfig};
 use magex_nets::commander::Commander;
 use magex_nets::params::to_safetensors;
 use magex_proto::v1;
@@ -161,7 +161,7 @@ fn weights(args: &AssignArgs, place: &Path) -> anyhow::Result<(Vec<u8>, RunConfi
         return Ok((trained.weights, trained.config, name));
     }
     let mut config = RunConfig::default();
-    config.commander = CommanderConfig { kind: CommanderKind::Pairwise, ..config.commander };
+    config.commander = CommanderConfig { kind: CommanderPolicy::Pairwise, ..config.commander };
     let params = Commander::init(&config.commander, config.task.agents, 2, config.run.seed)?;
     let bytes = to_safetensors(&[("commander", &params)], "{\"format\":1}")?;
     std::fs::create_dir_all(place)?;

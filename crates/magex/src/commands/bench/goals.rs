@@ -7,7 +7,7 @@ use crate::settings::{self, named};
 use anyhow::Context as _;
 use magex_assign::exact_points;
 use magex_assign::random::random;
-use magex_core::config::{CanonicalOrder, CommanderConfig, CommanderKind, RunConfig};
+use magex_core::config::{CanonicalOrder, CommanderConfig, CommanderPolicy, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
@@ -93,7 +93,7 @@ pub(super) fn commander(args: &CommanderArgs) -> anyhow::Result<Report> {
     let heading = ["commander", "N", "spawn", "mean ratio", "worst", "median µs"];
     let mut report = Report::new("commander", title, 1, &heading);
     let config = RunConfig::default();
-    let pairwise = CommanderConfig { kind: CommanderKind::Pairwise, ..config.commander.clone() };
+    let pairwise = CommanderConfig { kind: CommanderPolicy::Pairwise, ..config.commander.clone() };
     let untrained = Commander::of(&pairwise, 50, 2, &Commander::init(&pairwise, 50, 2, config.run.seed)?)?;
     let mut commanders = vec![("pairwise, untrained".to_owned(), untrained, None)];
     if let Some(run) = &args.run {
@@ -101,10 +101,10 @@ pub(super) fn commander(args: &CommanderArgs) -> anyhow::Result<Report> {
         trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
         let own = &trained.config;
         let loaded = crate::local::commander(own, &trained.weights, None)?;
-        let only = (own.commander.kind == CommanderKind::Ranking).then_some(own.task.agents);
+        let only = (own.commander.kind == CommanderPolicy::Ranking).then_some(own.task.agents);
         commanders.push((format!("{}, {}", own.commander.kind, trained.name), loaded, only));
     }
-    if let Some(random) = Commander::classical(CommanderKind::Random) {
+    if let Some(random) = Commander::classical(CommanderPolicy::Random) {
         commanders.push(("random".to_owned(), random, None));
     }
     for &agents in &args.agents {
@@ -200,7 +200,7 @@ pub(super) fn ranking(args: &RankingArgs) -> anyhow::Result<Report> {
         let task = TaskConfig::simple_spread(args.agents, spawn);
         task.validate().map_err(crate::failure::usage)?;
         let config = CommanderConfig {
-            kind: CommanderKind::Ranking,
+            kind: CommanderPolicy::Ranking,
             hidden: args.hidden,
             order: args.order,
             learning_rate: args.learning_rate,

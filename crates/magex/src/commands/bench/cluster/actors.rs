@@ -6,6 +6,7 @@ use bytes::Bytes;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_proto::convert::encode_result;
@@ -86,7 +87,7 @@ fn trajectory(task: &TaskConfig, shard: &Shard) -> Trajectory {
         positions: numbers((t + 1) * b * shape.bodies * shape.dims),
         velocities: numbers((t + 1) * b * shape.bodies * shape.dims),
         agent_state: numbers((t + 1) * b * n * shape.agent_state),
-        landmarks: numbers(b * shape.landmarks * shape.dims),
+        statics: Statics::landmarks(shape.landmarks, shape.dims, numbers(b * shape.landmarks * shape.dims)),
         goals: (0..b).flat_map(|_| 0..n as u32).collect(),
         actions: vec![1; t * b * n * shape.action_components],
         log_probs: numbers(t * b * n).iter().map(|x| -x).collect(),

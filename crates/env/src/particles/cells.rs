@@ -4,8 +4,8 @@
 //! Bodies outside the grid belong to its border cells; clamping moves no two bodies further apart, so neighbours still
 //! sit in neighbouring cells.
 
-use crate::physics::{Pairs, pack};
-use crate::real::Real;
+use super::physics::{Pairs, pack};
+use super::real::Real;
 
 /// Bodies compared at once.
 const BLOCK: usize = 16;

@@ -1,9 +1,9 @@
 //! B worlds of moving bodies, W to a block: their state, their contacts and a step of them. What a task makes of it
 //! (goals, reward, score) is the task's.
 
-use crate::cells::Cells;
-use crate::physics::{Bodies, Forces, Motion, Pairs, Physics, find_pairs};
-use crate::real::Real;
+use super::cells::Cells;
+use super::physics::{Bodies, Forces, Motion, Pairs, Physics, find_pairs};
+use super::real::Real;
 use std::ops::Range;
 
 /// The worlds, E bodies each; the first N of them act. Array element `[block · E + i][w]` belongs to body i of world

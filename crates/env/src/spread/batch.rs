@@ -1,11 +1,23 @@
 //! Simple Spread on B worlds, W to a block: goals, reward and bookkeeping.
 
-use crate::arrival::{Arrivals, View};
-use crate::physics::{Alike, Pair, Physics};
-use crate::real::Real;
-use crate::spread::{CONTACT_DISTANCE, COVER_RADIUS};
-use crate::swarm::Swarm;
+use crate::env::all_covered;
+use crate::matching::maximum_matching;
+use crate::particles::arrival::{Arrivals, View};
+use crate::particles::constants::CONTACT_DISTANCE;
+use crate::particles::physics::{Alike, Pair, Physics};
+use crate::particles::real::Real;
+use crate::particles::swarm::Swarm;
+use crate::shell::{Moment, Rules};
+use magex_core::error::FieldError;
+use magex_core::metrics_table::{
+    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
+    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
+};
 use magex_core::task::{RewardConfig, TaskConfig};
+use magex_core::trajectory::EpisodeMetrics;
+
+/// A landmark is covered when an agent's centre is within this distance (agent radius 0.1 + landmark radius 0.05).
+pub const COVER_RADIUS: f64 = 0.15;
 
 /// Coefficients of the reward in the physics' scalar.
 #[derive(Debug, Clone, Copy)]
@@ -60,14 +72,14 @@ impl<R: Real, const W: usize> Batch<R, W> {
         velocities: &[R],
         landmarks: Vec<R>,
         with_cells: bool,
-    ) -> Self {
+    ) -> Result<Self, FieldError> {
         let agents = task.agents;
         let kinds = Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE));
         let cells_over = with_cells.then_some(f64::from(task.side));
         let swarm = Swarm::new(kinds, (agents, agents), positions, velocities, cells_over);
         let blocks = swarm.worlds().div_ceil(W);
-        let law = RewardLaw::new(&task.reward);
-        Self {
+        let law = RewardLaw::new(task.reward()?);
+        Ok(Self {
             agents,
             gx: vec![[R::ZERO; W]; blocks * agents],
             gy: vec![[R::ZERO; W]; blocks * agents],
@@ -78,11 +90,11 @@ impl<R: Real, const W: usize> Batch<R, W> {
             reward_sum: vec![[0.0; W]; blocks],
             hit_sum: vec![[0.0; W]; blocks],
             rewards: vec![[R::ZERO; W]; agents],
-        }
+        })
     }
 
     /// `goals` is `[B, N]`, checked.
-    pub(crate) fn set_goals(&mut self, goals: &[u32]) {
+    fn place_goals(&mut self, goals: &[u32]) {
         for (k, &goal) in goals.iter().enumerate() {
             let (world, i) = (k / self.agents, k % self.agents);
             let from = 2 * (world * self.agents + goal as usize);
@@ -92,7 +104,7 @@ impl<R: Real, const W: usize> Batch<R, W> {
     }
 
     /// One joint step of every world, the `step`-th (from 1). `actions` and `rewards` are `[B, N]`, checked.
-    pub(crate) fn step(&mut self, step: u32, actions: &[u8], rewards: &mut [R]) {
+    pub(crate) fn advance(&mut self, step: u32, actions: &[u8], rewards: &mut [R]) {
         let per_block = self.agents * W;
         let blocks = actions.chunks(per_block).zip(rewards.chunks_mut(per_block)).enumerate();
         for (block, (actions, rewards)) in blocks {
@@ -143,36 +155,8 @@ impl<R: Real, const W: usize> Batch<R, W> {
         self.arrivals.observe(block, step, &view);
     }
 
-    pub(crate) fn worlds(&self) -> usize {
-        self.swarm.worlds()
-    }
-
-    pub(crate) fn landmarks(&self) -> &[R] {
-        &self.landmarks
-    }
-
-    /// Writes `[B, N, 2]`.
-    pub(crate) fn write_positions(&self, out: &mut [R]) {
-        self.swarm.write_positions(out);
-    }
-
-    /// Writes `[B, N, 2]`.
-    pub(crate) fn write_velocities(&self, out: &mut [R]) {
-        self.swarm.write_velocities(out);
-    }
-
-    /// Step of arrival of a world, if it has arrived.
-    pub(crate) fn arrival(&self, world: usize) -> Option<u32> {
-        self.arrivals.step(world)
-    }
-
-    /// Sums over agents and steps of a world: rewards, overlaps.
-    pub(crate) fn sums(&self, world: usize) -> (f64, f64) {
-        (self.reward_sum[world / W][world % W], self.hit_sum[world / W][world % W])
-    }
-
     /// For each landmark of a world, the agents within the covering radius of it.
-    pub(crate) fn near(&self, world: usize) -> Vec<Vec<u32>> {
+    fn near(&self, world: usize) -> Vec<Vec<u32>> {
         // Agents in groups that fill a register; the last group is filled up with agents out of everything's reach.
         const GROUP: usize = 16;
         let (from, w) = self.swarm.place(world, 0);
@@ -203,6 +187,51 @@ impl<R: Real, const W: usize> Batch<R, W> {
         let landmarks = &self.landmarks[2 * world * self.agents..2 * (world + 1) * self.agents];
         landmarks.chunks_exact(2).map(near).collect()
     }
+}
+
+impl<const W: usize> Rules for Batch<f32, W> {
+    fn set_goals(&mut self, goals: &[u32]) {
+        self.place_goals(goals);
+    }
+
+    fn step(&mut self, step: u32, _: &[u32], actions: &[u8], rewards: &mut [f32]) {
+        self.advance(step, actions, rewards);
+    }
+
+    fn write_positions(&self, out: &mut [f32]) {
+        self.swarm.write_positions(out);
+    }
+
+    fn write_velocities(&self, out: &mut [f32]) {
+        self.swarm.write_velocities(out);
+    }
+
+    fn success(&self, world: usize) -> f32 {
+        covered(&self.near(world), self.agents)
+    }
+
+    fn score(&self, world: usize, moment: &Moment<'_>) -> EpisodeMetrics {
+        let near = self.near(world);
+        let (reward, hits) = (self.reward_sum[world / W][world % W], self.hit_sum[world / W][world % W]);
+        let share = |count: usize| (count as f64 / self.agents as f64) as f32;
+        let agent_steps = f64::from(moment.steps.max(1)) * self.agents as f64;
+        let success = covered(&near, self.agents);
+        EpisodeMetrics::of([
+            (SUCCESS_RATE, success),
+            (MATCHED_SUCCESS_RATE, share(maximum_matching(&near, self.agents))),
+            (ALL_COVERED_RATE, all_covered(success)),
+            (SPAWN_SUCCESS_RATE, moment.spawn_success),
+            (ARRIVAL_STEP, self.arrivals.step(world).unwrap_or(moment.horizon + 1) as f32),
+            (COLLISIONS_PER_AGENT_STEP, (hits / agent_steps) as f32),
+            (COLLISION_RATE, 0.0),
+            (REWARD, (reward / agent_steps) as f32),
+        ])
+    }
+}
+
+/// Share of landmarks with anything near.
+fn covered(near: &[Vec<u32>], landmarks: usize) -> f32 {
+    (near.iter().filter(|agents| !agents.is_empty()).count() as f64 / landmarks as f64) as f32
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@
 //! control and F the contact forces at the positions before the step. Every pair closer than the sum of radii d0
 //! (softly) repels along the line of centres with F = 100 k ln(1 + e^(−(d − d0)/k)).
 
-use crate::real::{Real, softplus};
+use super::real::{Real, softplus};
 
 /// Constants of the world.
 #[derive(Debug, Clone, Copy)]

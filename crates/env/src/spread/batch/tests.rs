@@ -1,6 +1,6 @@
 use super::*;
-use crate::cells::Cells;
-use crate::physics::Pairs;
+use crate::particles::cells::Cells;
+use crate::particles::physics::Pairs;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
 
@@ -27,24 +27,24 @@ fn bits(values: &[f32]) -> Vec<u32> {
 /// Everything an episode produces, bit by bit.
 fn run<const W: usize>(task: &TaskConfig, state: &[Vec<f32>; 3], steps: &[Vec<u8>], cells: bool) -> Vec<Vec<u32>> {
     let [positions, velocities, landmarks] = state;
-    let mut batch = Batch::<f32, W>::new(task, positions, velocities, landmarks.clone(), cells);
-    let goals: Vec<u32> = (0..batch.worlds()).flat_map(|_| 0..task.agents as u32).collect();
-    batch.set_goals(&goals);
+    let mut batch = Batch::<f32, W>::new(task, positions, velocities, landmarks.clone(), cells).unwrap();
+    let goals: Vec<u32> = (0..batch.swarm.worlds()).flat_map(|_| 0..task.agents as u32).collect();
+    batch.place_goals(&goals);
     let mut log = Vec::new();
     for (t, actions) in steps.iter().enumerate() {
         let mut rewards = vec![0.0; actions.len()];
-        batch.step(t as u32 + 1, actions, &mut rewards);
+        batch.advance(t as u32 + 1, actions, &mut rewards);
         let mut state = vec![0.0; 2 * actions.len()];
         log.push(bits(&rewards));
-        batch.write_positions(&mut state);
+        batch.swarm.write_positions(&mut state);
         log.push(bits(&state));
-        batch.write_velocities(&mut state);
+        batch.swarm.write_velocities(&mut state);
         log.push(bits(&state));
     }
-    for world in 0..batch.worlds() {
-        let (reward, hits) = batch.sums(world);
+    for world in 0..batch.swarm.worlds() {
+        let (reward, hits) = (batch.reward_sum[world / W][world % W], batch.hit_sum[world / W][world % W]);
         log.push(bits(&[reward as f32, hits as f32]));
-        log.push(vec![batch.arrival(world).unwrap_or(0)]);
+        log.push(vec![batch.arrivals.step(world).unwrap_or(0)]);
         log.push(batch.near(world).concat());
     }
     log
@@ -80,7 +80,7 @@ fn cells_find_every_pair_once_even_far_outside_the_grid() {
             (x[i] - x[j]).mul_add(x[i] - x[j], (y[i] - y[j]) * (y[i] - y[j])) < 0.236 * 0.236
         };
         let all = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
-        let expected: Vec<u32> = all.filter(near).map(|(i, j)| crate::physics::pack(i, j)).collect();
+        let expected: Vec<u32> = all.filter(near).map(|(i, j)| crate::particles::physics::pack(i, j)).collect();
         assert_eq!(found, expected);
     }
 }
@@ -90,10 +90,10 @@ fn kicks(positions: &[f64]) -> Vec<f64> {
     let agents = positions.len() / 2;
     let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
     let rest = vec![0.0; positions.len()];
-    let mut batch = Batch::<f64, 4>::new(&task, positions, &rest, positions.to_vec(), false);
-    batch.step(1, &vec![0; agents], &mut vec![0.0; agents]);
+    let mut batch = Batch::<f64, 4>::new(&task, positions, &rest, positions.to_vec(), false).unwrap();
+    batch.advance(1, &vec![0; agents], &mut vec![0.0; agents]);
     let mut velocities = vec![0.0; positions.len()];
-    batch.write_velocities(&mut velocities);
+    batch.swarm.write_velocities(&mut velocities);
     velocities
 }
 

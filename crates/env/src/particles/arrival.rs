@@ -4,8 +4,8 @@
 //! when it is covered itself, so the usual cost of a step is one landmark instead of N. With N ≥ 100, where 99 % are
 //! enough, ⌊N / 100⌋ + 1 uncovered landmarks are the proof, found by a scan that starts at the witness.
 
-use crate::cells::Cells;
-use crate::real::Real;
+use super::cells::Cells;
+use super::real::Real;
 
 /// The arrival steps of a batch.
 #[derive(Debug, Clone)]
@@ -87,7 +87,7 @@ impl<R: Real, const W: usize> Arrivals<R, W> {
         }
     }
 
-    /// Finds more than `allowed` uncovered landmarks and remembers the first; false if there are not so many.
+    /// Finds more than `allowed` uncovered landmarks and remembers the first; false if there are fewer.
     fn find_witness(&mut self, block: usize, w: usize, view: &View<'_, R, W>) -> bool {
         let n = view.x.len();
         let landmarks = &view.landmarks[2 * n * w..2 * n * (w + 1)];

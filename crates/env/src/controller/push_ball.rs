@@ -4,11 +4,12 @@
 //! happens does not: of all sequences of three actions, each held for two steps, the agent starts the one after which its
 //! ball would come to rest best, and itself be best placed to push on.
 
-use crate::env::View;
+use crate::controller::interface::Controller;
 use crate::error::{EnvError, check_len};
-use crate::physics::{Bodies, Forces, Motion, Pair, Physics, pack};
+use crate::particles::physics::{Bodies, Forces, Motion, Pair, Physics, pack};
 use crate::push_ball::law::angle;
 use crate::push_ball::{AGENT_RADIUS, BALL_RADIUS, PUSH_DISTANCE, REACHED};
+use magex_core::joint_state::JointState;
 
 /// Sequences tried at once: 5³, filled up to whole registers.
 const LANES: usize = 128;
@@ -23,38 +24,51 @@ const ARC: f32 = 0.3;
 /// Weight of the ball's way against the agent's.
 const BALL_WEIGHT: f32 = 3.0;
 
-/// Chooses an action for every agent of S states of Push Ball; `agents` is N, `actions` `[S, N]` is overwritten. Ties go to
-/// the lower action.
-pub fn scripted_push_ball(view: &View<'_>, agents: usize, actions: &mut [u8]) -> Result<(), EnvError> {
-    let n = agents;
-    let episodes = view.goals.len() / (2 * n).max(1);
-    let states = actions.len() / n.max(1);
-    check_len("goals", view.goals.len(), 2 * n * episodes.max(usize::from(states > 0)))?;
-    check_len("landmarks", view.landmarks.len(), 2 * n * episodes)?;
-    check_len("actions", actions.len(), n * states.next_multiple_of(episodes.max(1)))?;
-    check_len("positions", view.positions.len(), 4 * n * states)?;
-    check_len("velocities", view.velocities.len(), 4 * n * states)?;
-    check_len("agent_state", view.agent_state.len(), 0)?;
-    if let Some(place) = view.goals.iter().position(|&goal| goal as usize >= n) {
-        let goal = view.goals[place];
-        return Err(match place % 2 {
-            0 => EnvError::Ball { place, goal, balls: n },
-            _ => EnvError::Goal { place, goal, landmarks: n },
-        });
+/// Chooses an action for every agent of S states of Push Ball. Ties go to the lower action.
+#[derive(Debug)]
+pub struct PushBallScript {
+    agents: usize,
+    model: Model,
+}
+
+impl PushBallScript {
+    /// For teams of N agents.
+    pub fn new(agents: usize) -> Self {
+        Self { agents, model: Model::new() }
     }
-    let mut model = Model::new();
-    for (state, actions) in actions.chunks_exact_mut(n.max(1)).enumerate() {
-        let (bodies, goals) = (4 * n * state..4 * n * (state + 1), 2 * n * (state % episodes)..);
-        let world =
-            World { agents: n, positions: &view.positions[bodies.clone()], velocities: &view.velocities[bodies] };
-        for (i, action) in actions.iter_mut().enumerate() {
-            let goal = &view.goals[goals.start + 2 * i..goals.start + 2 * i + 2];
-            let landmark = goals.start + 2 * goal[1] as usize;
-            model.load(&world, i, n + goal[0] as usize);
-            *action = model.best([view.landmarks[landmark], view.landmarks[landmark + 1]]);
+}
+
+impl Controller for PushBallScript {
+    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), EnvError> {
+        let (n, landmarks) = (self.agents, state.landmarks());
+        let episodes = state.goals.len() / (2 * n).max(1);
+        let states = actions.len() / n.max(1);
+        check_len("goals", state.goals.len(), 2 * n * episodes.max(usize::from(states > 0)))?;
+        check_len("landmarks", landmarks.len(), 2 * n * episodes)?;
+        check_len("actions", actions.len(), n * states.next_multiple_of(episodes.max(1)))?;
+        check_len("positions", state.positions.len(), 4 * n * states)?;
+        check_len("velocities", state.velocities.len(), 4 * n * states)?;
+        check_len("agent_state", state.agent_state.len(), 0)?;
+        if let Some(place) = state.goals.iter().position(|&goal| goal as usize >= n) {
+            let goal = state.goals[place];
+            return Err(match place % 2 {
+                0 => EnvError::Ball { place, goal, balls: n },
+                _ => EnvError::Goal { place, goal, landmarks: n },
+            });
         }
+        for (s, actions) in actions.chunks_exact_mut(n.max(1)).enumerate() {
+            let (bodies, goals) = (4 * n * s..4 * n * (s + 1), 2 * n * (s % episodes)..);
+            let world =
+                World { agents: n, positions: &state.positions[bodies.clone()], velocities: &state.velocities[bodies] };
+            for (i, action) in actions.iter_mut().enumerate() {
+                let goal = &state.goals[goals.start + 2 * i..goals.start + 2 * i + 2];
+                let landmark = goals.start + 2 * goal[1] as usize;
+                self.model.load(&world, i, n + goal[0] as usize);
+                *action = self.model.best([landmarks[landmark], landmarks[landmark + 1]]);
+            }
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// One joint state.
@@ -72,6 +86,7 @@ impl World<'_> {
 }
 
 /// What the bodies of the model are.
+#[derive(Debug)]
 struct Kinds {
     /// Agent and agent, agent and ball, ball and ball.
     pairs: [Pair<f32>; 3],
@@ -95,6 +110,7 @@ impl Bodies<f32> for Kinds {
 }
 
 /// The agent (body 0), its ball (body 1) and what is near them, once per sequence of actions.
+#[derive(Debug)]
 struct Model {
     physics: Physics<f32>,
     kinds: Kinds,

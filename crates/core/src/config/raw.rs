@@ -1,0 +1,101 @@
+//! The configuration as it is written: TOML in which nearly every key may be missing.
+
+use super::{CollectConfig, CommanderConfig, ConfigError, ExecutorConfig, MappoConfig, RunConfig, RunSection};
+use crate::error::FieldError;
+use crate::task::{NOT_ZERO, RawTask};
+use crate::toml_table;
+use serde::Deserialize;
+use toml::Table;
+
+/// Keys that had another name: the old one and the present one. The old one is refused, naming the present one.
+pub const RENAMED: &[(&str, &str)] = &[
+    ("mappo.chunk", "mappo.chunk_length"),
+    ("mappo.minibatch", "mappo.minibatch_size"),
+    ("mappo.clip", "mappo.clip_epsilon"),
+    ("mappo.entropy", "mappo.entropy_coef"),
+    ("mappo.bootstrap", "mappo.bootstrap_at_horizon"),
+    ("mappo.grad_shards", "mappo.gradient_slices"),
+    ("mappo.episodes", "collect.episodes_per_iteration"),
+    ("mappo.shards", "collect.shards_per_iteration"),
+    ("commander.random_share", "commander.random_assignment_fraction"),
+    ("task.push_ball.arc", "task.push_ball.turn_length"),
+    ("task.push_ball.aligned", "task.push_ball.start_in_line_fraction"),
+];
+
+/// The sections of a file; those that are missing are empty.
+#[derive(Deserialize, Default)]
+#[serde(deny_unknown_fields, default)]
+struct Sections {
+    run: Table,
+    task: Option<Table>,
+    executor: Table,
+    commander: Table,
+    collect: Table,
+    mappo: Table,
+}
+
+/// `[collect]` as it is written.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct RawCollect {
+    episodes_per_iteration: Option<u32>,
+    shards_per_iteration: u32,
+}
+
+impl Default for RawCollect {
+    fn default() -> Self {
+        Self { episodes_per_iteration: None, shards_per_iteration: 4 }
+    }
+}
+
+/// A configuration whose keys and types are known to be right; ranges are not checked and derived defaults not filled in.
+pub(super) struct RawRunConfig {
+    run: RunSection,
+    task: Option<RawTask>,
+    executor: ExecutorConfig,
+    commander: CommanderConfig,
+    collect: RawCollect,
+    mappo: MappoConfig,
+}
+
+impl RawRunConfig {
+    pub(super) fn from_toml(text: &str) -> Result<Self, ConfigError> {
+        let file: Table = toml::from_str(text).map_err(|e| ConfigError::Syntax(e.to_string().trim().to_owned()))?;
+        refuse_renamed(&file)?;
+        let sections: Sections = toml_table::read("", file)?;
+        Ok(Self {
+            run: toml_table::read("run", sections.run)?,
+            task: sections.task.map(RawTask::read).transpose()?,
+            executor: toml_table::read("executor", sections.executor)?,
+            commander: toml_table::read("commander", sections.commander)?,
+            collect: toml_table::read("collect", sections.collect)?,
+            mappo: toml_table::read("mappo", sections.mappo)?,
+        })
+    }
+
+    /// Fills in the defaults that are derived from other values.
+    pub(super) fn resolve(self) -> Result<RunConfig, FieldError> {
+        let Self { run, task, executor, commander, collect, mappo } = self;
+        let task = task.map_or_else(|| Ok(RunConfig::default().task), RawTask::resolve)?;
+        let shards_per_iteration = collect.shards_per_iteration;
+        let episodes_per_iteration = match collect.episodes_per_iteration {
+            Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO)),
+            Some(episodes) => episodes,
+            None => super::derived_episodes(task.agents, shards_per_iteration),
+        };
+        let collect = CollectConfig { episodes_per_iteration, shards_per_iteration };
+        Ok(RunConfig { run, task, executor, commander, collect, mappo })
+    }
+}
+
+fn refuse_renamed(file: &Table) -> Result<(), FieldError> {
+    let present = |key: &str| {
+        let mut path = key.split('.');
+        let first = path.next().and_then(|section| file.get(section));
+        path.try_fold(first?, |value, key| value.as_table()?.get(key))
+    };
+    match RENAMED.iter().find(|(old, _)| present(old).is_some()) {
+        Some((old, new)) => Err(FieldError::new(*old, format!("this key is now {new}; rename it"))),
+        None => Ok(()),
+    }
+}

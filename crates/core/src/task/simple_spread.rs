@@ -1,0 +1,119 @@
+//! Simple Spread (paper, section 5.1.1) as data.
+
+use super::definition::{Definition, coefficients, fits, up_to_tens, wrong_task};
+use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
+use crate::error::FieldError;
+use crate::toml_table;
+use serde::{Deserialize, Serialize};
+
+/// `[task.reward]`: coefficients of the reward (paper, eq. 9):
+/// r = bonus · 1[d ≤ 0.15] − distance · d / d_ref − collision · #{other agents closer than 0.2}.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct RewardConfig {
+    /// α: paid on every step on which the agent is within 0.15 of its goal (metric distance).
+    pub bonus: f32,
+    /// β: charged per unit of d / d_ref.
+    pub distance: f32,
+    /// γ: charged for every other agent closer than two radii.
+    pub collision: f32,
+    /// d_ref in world units.
+    pub distance_unit: f32,
+}
+
+/// `[task.reward]` as it is written: the unit of distance is the side of the map unless it is given.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct RawReward {
+    bonus: f32,
+    distance: f32,
+    collision: f32,
+    distance_unit: Option<f32>,
+}
+
+impl Default for RawReward {
+    fn default() -> Self {
+        Self { bonus: 1.0, distance: 1.0, collision: 1.0, distance_unit: None }
+    }
+}
+
+impl RawReward {
+    fn settings(self, side: f32) -> TaskSettings {
+        let Self { bonus, distance, collision, distance_unit } = self;
+        TaskSettings::SimpleSpread(RewardConfig {
+            bonus,
+            distance,
+            collision,
+            distance_unit: distance_unit.unwrap_or(side),
+        })
+    }
+}
+
+pub(super) const DEFINITION: Definition = Definition {
+    title: "Simple Spread",
+    section: "reward",
+    dims: 2,
+    has_balls: false,
+    agent_state: 0,
+    crashes: false,
+    action_code: ActionCode::Thrust,
+    stages: &[Stage { from: Group::Agents, to: Group::Landmarks }],
+    statics: |task| vec![task.landmarks_spec()],
+    observation: Observation::SIMPLE_SPREAD,
+    landmark_radius: 0.05,
+    step_seconds: 0.1,
+    side: |agents| match agents {
+        5 => 2.0,
+        20 => 6.0,
+        50 => 10.0,
+        n => (2.0 * n as f32).sqrt(),
+    },
+    horizon: |agents, side| match agents {
+        5 => 60,
+        20 => 100,
+        50 => 120,
+        _ => up_to_tens(20.0 + 10.0 * side),
+    },
+    layout_scale: |agents| if agents <= 20 { 1.5 } else { 2.0 },
+    default_settings: |side| RawReward::default().settings(side),
+    read_settings: |side, section| {
+        let raw: RawReward = toml_table::read("task.reward", section)?;
+        if raw.distance_unit == Some(0.0) {
+            return Err(FieldError::new("task.reward.distance_unit", super::NOT_ZERO));
+        }
+        Ok(raw.settings(side))
+    },
+    validate,
+};
+
+fn validate(task: &TaskConfig) -> Result<(), FieldError> {
+    let r = task.reward()?;
+    coefficients("task.reward", &[("bonus", r.bonus), ("distance", r.distance), ("collision", r.collision)])?;
+    if !(r.distance_unit.is_finite() && r.distance_unit > 0.0) {
+        return Err(FieldError::new("task.reward.distance_unit", format!("{} must be positive", r.distance_unit)));
+    }
+    if task.spawn == Spawn::Uniform { fits(task, "agents", task.agents, 0.2) } else { Ok(()) }
+}
+
+impl TaskConfig {
+    /// Simple Spread with the paper's sizes for N agents.
+    pub fn simple_spread(agents: usize, spawn: Spawn) -> Self {
+        Self::of(TaskName::SimpleSpread, agents, spawn)
+    }
+
+    /// What only Simple Spread has; an error in any other task.
+    pub fn reward(&self) -> Result<&RewardConfig, FieldError> {
+        match &self.settings {
+            TaskSettings::SimpleSpread(reward) => Ok(reward),
+            _ => Err(wrong_task(self, TaskName::SimpleSpread)),
+        }
+    }
+}
+
+/// A unit of distance that was the side of the map stays the side of the map.
+pub(super) fn follow_side(settings: &mut TaskSettings, from: f32, to: f32) {
+    if let TaskSettings::SimpleSpread(reward) = settings
+        && reward.distance_unit == from
+    {
+        reward.distance_unit = to;
+    }
+}

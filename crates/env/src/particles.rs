@@ -1,0 +1,10 @@
+//! The particle engine that Simple Spread and Push Ball share: physics, contacts, arrivals, and where episodes start.
+
+pub(crate) mod arrival;
+pub(crate) mod cells;
+pub mod constants;
+pub mod curves;
+pub(crate) mod physics;
+pub(crate) mod placement;
+pub mod real;
+pub(crate) mod swarm;
