@@ -1,18 +1,18 @@
 //! The contract on top of the parts: who may, what is asked, who answers.
 
-use crate::answering::{Answering, Clock};
-use crate::batch::{self, Batches};
-use crate::keeper::{self, Keeper};
+use crate::assign_service::{Answering, Clock};
+use crate::shard_assign::{self, Batches};
+use crate::mission_service::{self, Keeper};
 use crate::metadata;
 use crate::scheduler::{GoalRequest, SchedulerKind};
-use crate::store::Store;
+use crate::model_store::Store;
 use crate::streams::{self, Interest};
 use magex_dispatch::{Limits, Problem};
 use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
-use magex_runtime::access::{Role, caller};
-use magex_runtime::admission::Admission;
+use magex_runtime::net::auth::{Role, caller};
+use magex_runtime::net::in_flight::Admission;
 use magex_runtime::{status, trace};
 use std::sync::Arc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -99,7 +99,7 @@ impl CommanderService for CommanderApi {
         trace::continue_from(&span, trace::of(request.metadata()));
         let clock = Clock::start(metadata::deadline(request.metadata()));
         let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(invalid)?;
-        batch::check(&request, &key, &self.limits)?;
+        shard_assign::check(&request, &key, &self.limits)?;
         let version = request.shard.version;
         let request = Arc::new(request);
         let answer = self.batches.answer(request.clone(), &key, clock, &self.draining);
@@ -149,7 +149,7 @@ impl CommanderService for CommanderApi {
                 format!("{} names are more than {WATCHED}; leave them out to watch all", request.mission_ids.len());
             return Err(status::invalid_argument("mission_ids", problem));
         }
-        let source = keeper::source("source", request.source)?;
+        let source = mission_service::source("source", request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
         let (watcher, stream) = streams::channel();
         tokio::spawn(streams::watch(self.keeper.clone(), interest, watcher, self.draining.clone()));

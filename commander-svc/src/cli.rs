@@ -1,7 +1,7 @@
 //! The commander's command line.
 
 use crate::service::{CommanderConfig, ServeError, run as serve};
-use crate::trained::load_scheduler;
+use crate::run_scheduler::load_scheduler;
 use crate::weights_file::WeightsFile;
 use clap::Args;
 use magex_dispatch::Limits;

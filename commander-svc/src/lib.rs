@@ -1,18 +1,18 @@
-//! The goal commander as a service: for the actors of a run, and for anybody who has agents and goals.
-mod answering;
+//! The goal commander as a service: for the actors of a run, and for outside clients with agents and goals.
 mod api;
-mod batch;
+mod assign_service;
 mod classical;
 pub mod cli;
-mod gauges;
-mod keeper;
-pub mod learned;
 mod metadata;
+mod metrics;
+mod mission_service;
+mod model_store;
+pub mod run_scheduler;
 pub mod scheduler;
 pub mod service;
-mod store;
+mod shard_assign;
+pub mod shard_goals;
 mod streams;
 mod subscription;
-pub mod trained;
-mod training;
+mod training_view;
 pub mod weights_file;

@@ -5,5 +5,5 @@ use tonic::metadata::MetadataMap;
 
 /// The call's own deadline.
 pub(crate) fn deadline(metadata: &MetadataMap) -> Option<Duration> {
-    magex_runtime::deadline::requested(metadata.get("grpc-timeout")?.to_str().ok()?)
+    magex_runtime::net::deadline::requested(metadata.get("grpc-timeout")?.to_str().ok()?)
 }

@@ -1,12 +1,12 @@
 //! How the commander is put together and served.
 
-use crate::answering::Answering;
+use crate::assign_service::Answering;
 use crate::api::{CommanderApi, STREAMS};
-use crate::batch::Batches;
-use crate::gauges::{self, CommanderGauges};
-use crate::keeper::Keeper;
+use crate::shard_assign::Batches;
+use crate::metrics::{self, CommanderGauges};
+use crate::mission_service::Keeper;
 use crate::scheduler::LoadScheduler;
-use crate::store::Store;
+use crate::model_store::Store;
 use crate::subscription;
 use crate::weights_file::{WeightsError, WeightsFile};
 use magex_dispatch::Limits;
@@ -14,11 +14,11 @@ use magex_dispatch::disk::{Disk, DiskError};
 use magex_dispatch::missions::{Bounds, Missions};
 use magex_proto::v1::commander_service_server::CommanderServiceServer;
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_BATCH_BYTES};
-use magex_runtime::admission::{Admission, FlightLimits, Kind};
-use magex_runtime::calls::Counted;
+use magex_runtime::net::in_flight::{Admission, FlightLimits, Kind};
+use magex_runtime::net::call_metrics::Counted;
 use magex_runtime::client::{Settings, UrlError};
-use magex_runtime::deadline::Deadline;
-use magex_runtime::door::{Door, Open, Rules};
+use magex_runtime::net::deadline::Deadline;
+use magex_runtime::net::guard::{Door, Open, Rules};
 use magex_runtime::health::Health;
 use magex_runtime::metrics::Metrics;
 use magex_runtime::security::Security;
@@ -162,7 +162,7 @@ pub async fn run(
         }
     });
     let (limits, store_of_api) = (config.limits, store.clone());
-    gauges::watch(&config.metrics, &gauges, &store, &keeper, &admission, &answering);
+    metrics::watch(&config.metrics, &gauges, &store, &keeper, &admission, &answering);
     let api = CommanderApi {
         store: store_of_api,
         batches: Batches::new(store.clone(), answering.clone()),

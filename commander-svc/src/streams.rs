@@ -1,12 +1,12 @@
 //! The streaming calls: teams one after the other, and watching missions.
 
-use crate::answering::{Answering, Clock};
-use crate::keeper::{Event, Keeper, now_ms, visible};
+use crate::assign_service::{Answering, Clock};
+use crate::mission_service::{Event, Keeper, now_ms, visible};
 use magex_dispatch::missions::passes;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
-use magex_runtime::access::Caller;
-use magex_runtime::admission::{Admission, stopping};
+use magex_runtime::net::auth::Caller;
+use magex_runtime::net::in_flight::{Admission, stopping};
 use magex_runtime::status;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;

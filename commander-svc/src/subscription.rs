@@ -1,7 +1,7 @@
 //! Keeps the store filled with what the learner publishes.
 
 use crate::scheduler::{LoadScheduler, WeightsKey};
-use crate::store::{Model, Store};
+use crate::model_store::{Model, Store};
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::weights::{Weights, WeightsAssembler};
 use magex_proto::{MAX_MESSAGE_BYTES, v1};

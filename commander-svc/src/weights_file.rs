@@ -1,7 +1,7 @@
 //! Weights from a run folder or a file, and again whenever the file is replaced.
 
 use crate::scheduler::{LoadScheduler, WeightsKey};
-use crate::store::{Model, Store};
+use crate::model_store::{Model, Store};
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::weights::sha256_hex;
 use std::path::{Path, PathBuf};

@@ -6,7 +6,7 @@ use magex_actor::policy::PolicyWorker;
 use magex_actor::run::ActorConfig;
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
 use magex_commander::service::CommanderConfig;
-use magex_commander::trained::load_scheduler;
+use magex_commander::run_scheduler::load_scheduler;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::{RunId, Shard};
 use magex_core::trajectory::ShardResult;

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_commander::service::CommanderConfig;
-use magex_commander::trained::load_scheduler;
+use magex_commander::run_scheduler::load_scheduler;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_proto::convert::encode_result;

@@ -2,7 +2,7 @@
 //!
 //! Read-only. It listens on loopback unless told otherwise; nothing of it is needed for training.
 
-use crate::connections::{ConnectionLimits, Incoming};
+use crate::net::connections::{ConnectionLimits, Incoming};
 use crate::metrics::Metrics;
 use crate::server::{self, BindError, GRACE};
 pub use axum::Router;

@@ -1,8 +1,8 @@
 //! The options of security: certificates, identities, tokens. The same for every service.
 
-use crate::access::Access;
+use crate::net::auth::Access;
 use crate::client::{Settings, Token};
-use crate::connections::ConnectionLimits;
+use crate::net::connections::ConnectionLimits;
 use crate::exit::Failure;
 use crate::server;
 use crate::tls::{ClientTls, ServerTls};

@@ -1,8 +1,8 @@
 //! Listening and serving.
 
-pub use crate::connections::Incoming;
-use crate::connections::{ConnectionLimits, Connections};
-use crate::door::Open;
+pub use crate::net::connections::Incoming;
+use crate::net::connections::{ConnectionLimits, Connections};
+use crate::net::guard::Open;
 use crate::tls::{ServerTls, TlsError};
 use std::future::Future;
 use std::io::{Error, ErrorKind};

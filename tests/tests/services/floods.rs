@@ -7,7 +7,7 @@ use magex_commander::service::CommanderConfig;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::client::{Settings, endpoint};
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use magex_runtime::security::Security;
 use magex_runtime::status;
 use std::pin::Pin;

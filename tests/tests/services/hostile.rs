@@ -11,7 +11,7 @@ use magex_commander::weights_file::WeightsFile;
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::v1;
 use magex_runtime::client::endpoint;
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};

@@ -25,7 +25,7 @@ use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::weights::Weights;
 use magex_proto::{PROTOCOL_VERSION, parts, v1};
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use magex_runtime::security::Security;
 use magex_runtime::{client, server};
 use std::sync::Arc;

@@ -9,7 +9,7 @@ use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::weights::sha256_hex;
-use magex_runtime::access::Access;
+use magex_runtime::net::auth::Access;
 use magex_runtime::client::{Channel, Settings, Token};
 use magex_runtime::security::Security;
 use std::path::Path;

@@ -1,11 +1,11 @@
 //! The commander's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
 
-use crate::answering::Answering;
-use crate::keeper::Keeper;
+use crate::assign_service::Answering;
+use crate::mission_service::Keeper;
 use crate::scheduler::SchedulerKind;
-use crate::store::Store;
-use magex_runtime::admission::{Admission, Kind};
-use magex_runtime::calls::Calls;
+use crate::model_store::Store;
+use magex_runtime::net::in_flight::{Admission, Kind};
+use magex_runtime::net::call_metrics::Calls;
 use magex_runtime::metrics::{Counter, Counters, Gauge, Metrics, SecondsBy};
 use std::sync::{Arc, Weak};
 use std::time::Duration;

@@ -1,5 +1,5 @@
 use super::*;
-use crate::admission::FlightLimits;
+use crate::net::in_flight::FlightLimits;
 use http_body::Body as _;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;

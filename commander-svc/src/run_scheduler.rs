@@ -1,6 +1,6 @@
 //! The scheduler of production: the commander that a run's weights contain.
 
-use crate::learned::answer;
+use crate::shard_goals::answer;
 use crate::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest};
 use magex_assign::UNASSIGNED;
 use magex_core::config::RunConfig;

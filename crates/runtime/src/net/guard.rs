@@ -1,11 +1,11 @@
 //! What stands before a service: who calls, how much it has in flight already, how much is on its way. All of that is known
 //! from a call's headers and from the length that a message announces, before anything of it is decoded.
 
-mod plain;
+mod truncate_status;
 
-use crate::access::{Access, Caller, Role};
-use crate::admission::{Admission, Kind, Slot};
-use crate::connections::Connections;
+use crate::net::auth::{Access, Caller, Role};
+use crate::net::in_flight::{Admission, Kind, Slot};
+use crate::net::connections::Connections;
 use http_body::{Frame, SizeHint};
 use std::convert::Infallible;
 use std::future::Future;
@@ -98,7 +98,7 @@ fn held(
 ) -> Answer {
     Box::pin(async move {
         let mut response = answer.await?;
-        plain::shorten(response.headers_mut());
+        truncate_status::truncate_status(response.headers_mut());
         Ok(response.map(|body| Body::new(Held { body, _slot: slot })))
     })
 }
@@ -299,7 +299,7 @@ impl http_body::Body for Held {
         if let Poll::Ready(Some(Ok(frame))) = &mut next
             && let Some(trailers) = frame.trailers_mut()
         {
-            plain::shorten(trailers);
+            truncate_status::truncate_status(trailers);
         }
         next
     }

@@ -1,9 +1,9 @@
 //! The teams of a shard, for actors: what may be asked, and on which threads it is answered.
 
-use crate::answering::{Answering, Clock};
+use crate::assign_service::{Answering, Clock};
 use crate::classical;
 use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind, WeightsKey};
-use crate::store::Store;
+use crate::model_store::Store;
 use magex_dispatch::Limits;
 use magex_runtime::status;
 use std::sync::Arc;

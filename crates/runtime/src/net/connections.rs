@@ -6,7 +6,7 @@
 //! room the one that has waited longest makes way: a flood of idle sockets pushes itself out, and who has something to ask
 //! still gets in.
 
-use crate::admission::{Admission, FlightLimits};
+use crate::net::in_flight::{Admission, FlightLimits};
 use std::collections::{BTreeMap, HashMap};
 use std::future::Future as _;
 use std::io::{Error, ErrorKind, IoSlice};

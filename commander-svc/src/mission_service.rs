@@ -1,14 +1,14 @@
 //! Missions behind the API: planned on threads of their own, kept, and told to whoever watches.
 
-use crate::answering::{Answering, Clock, refusal};
-use crate::batch::Gone;
+use crate::assign_service::{Answering, Clock, refusal};
+use crate::shard_assign::Gone;
 use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
-use crate::training::{Episode, Training, TrainingShard};
+use crate::training_view::{Episode, Training, TrainingShard};
 use magex_dispatch::mission::{Mission, Planned};
 use magex_dispatch::missions::{KeepError, Missions, passes};
 use magex_dispatch::{DispatchError, Problem};
 use magex_proto::v1;
-use magex_runtime::access::{Caller, Role};
+use magex_runtime::net::auth::{Caller, Role};
 use magex_runtime::backoff::incarnation;
 use magex_runtime::status;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -354,7 +354,7 @@ fn kept(error: KeepError) -> Status {
         KeepError::Missing(_) => Status::not_found(text),
         KeepError::Full(_) => status::resource_exhausted(text, FULL),
         KeepError::Changed { .. } => Status::aborted(text),
-        KeepError::Closed => magex_runtime::admission::stopping(),
+        KeepError::Closed => magex_runtime::net::in_flight::stopping(),
         KeepError::Disk(_) => {
             tracing::error!(error = text, "missions cannot be written");
             // The file is opened anew: this passes when there is room.

@@ -1,6 +1,6 @@
 use super::*;
-use crate::gauges::CommanderGauges;
-use crate::store::Store;
+use crate::metrics::CommanderGauges;
+use crate::model_store::Store;
 use magex_dispatch::disk::DiskError;
 use magex_dispatch::missions::Bounds;
 use magex_runtime::metrics::Metrics;
@@ -33,7 +33,7 @@ fn clock() -> Clock {
     Clock::start(None)
 }
 
-async fn all_processors(keeper: &Keeper) -> Vec<crate::answering::Places> {
+async fn all_processors(keeper: &Keeper) -> Vec<crate::assign_service::Places> {
     let mut taken = Vec::new();
     while keeper.answering.free_processors() > 0 {
         taken.push(keeper.answering.places(1, clock().left()).await.unwrap());

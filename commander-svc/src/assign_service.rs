@@ -3,10 +3,10 @@
 //! Small teams are answered where the call came in: handing them to another thread costs more than the answer. Large ones
 //! go to threads of their own, as many at once as there are processors and as there is memory.
 
-use crate::batch::Gone;
-use crate::gauges::CommanderGauges;
+use crate::shard_assign::Gone;
+use crate::metrics::CommanderGauges;
 use crate::scheduler::{Scheduler, SchedulerKind, TeamReply, TeamRequest, WeightsKey};
-use crate::store::Store;
+use crate::model_store::Store;
 use magex_dispatch::mission::Planned;
 use magex_dispatch::{DispatchError, Problem, answer, engine};
 use magex_proto::v1;

@@ -1,6 +1,6 @@
 //! Who is let in now: nobody while the service drains, and nobody with too much in flight already.
 
-use crate::access::Caller;
+use crate::net::auth::Caller;
 use crate::status;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -158,7 +158,7 @@ impl Drop for Slot {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::access::Role;
+    use crate::net::auth::Role;
 
     fn caller(name: &str) -> Caller {
         Caller { name: name.into(), role: Role::Client }
