@@ -6,11 +6,11 @@ use clap::Args;
 use magex_core::config::RunConfig;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
-use magex_runtime::http::{self, HttpArgs, Page};
+use magex_runtime::http;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::process;
 use magex_runtime::security::CallerArgs;
-use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
-use magex_runtime::{process, shutdown};
+use magex_runtime::service::{self, ServiceArgs};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -36,74 +36,38 @@ pub struct ActorArgs {
     /// Wait for another run when this one is complete
     #[arg(long, env = "MAGEX_ACTOR_STAY")]
     pub stay: bool,
-    /// What operators look at
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub http: HttpArgs,
-    /// Where traces go
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub traces: TraceArgs,
     /// What learner and commander are shown.
     #[command(flatten)]
     #[serde(flatten)]
     pub security: CallerArgs,
-    /// How log lines look
-    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
-    #[serde(skip)]
-    pub log_format: LogFormat,
-    /// Print the options in effect and exit
-    #[arg(long)]
-    #[serde(skip)]
-    pub print_config: bool,
-    /// Ask the actor whose page is at --http whether it lives, and exit: 0 it does, 1 it does not
-    #[arg(long)]
-    #[serde(skip)]
-    pub health_check: bool,
+    /// Options of every service
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub service: ServiceArgs,
 }
 
 /// Runs an actor until it is told to stop or the run is complete. The exit code, or why it failed.
 pub fn run(args: ActorArgs) -> Result<u8, Failure> {
-    if args.health_check {
-        return probe::own_page(args.http.http.as_deref());
+    if args.service.health_check {
+        return probe::own_page(args.service.http.http.as_deref());
     }
-    if args.print_config {
+    if args.service.print_config {
         process::print(&toml::to_string(&args).map_err(Failure::usage)?);
         return Ok(exit::OK);
     }
     let config = configure(&args)?;
-    process::refuse_huge_pages();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .thread_name("magex-net")
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
-    let telemetry = {
-        let _runtime = runtime.enter();
-        telemetry::init("magex-actor", args.log_format, &args.traces).map_err(Failure::usage)?
-    };
-    let end = runtime.block_on(async {
-        let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        let page = args.http.bind().await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-        process::announce_ready("actor", None, page.as_ref().map(Page::address));
+    let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
-        if let Some(page) = page {
-            page.serve(http::routes(metrics.clone()), stop.clone());
-        }
-        run_watched(config, PolicyWorker::maker(), &metrics, stop).await.map_err(|error| match &error {
+        context.announce(http::routes(metrics.clone()));
+        run_watched(config, PolicyWorker::maker(), &metrics, context.stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
-            // A new process may fare better.
+            // A new process may succeed.
             ActorError::SentAway { .. } => Failure::new(exit::INTERNAL, &error),
             ActorError::Refused { .. } | ActorError::Useless(_) | ActorError::Worker { .. } => {
                 Failure::new(exit::UNAVAILABLE, &error)
             }
         })
-    });
-    telemetry.flush();
-    // A rollout thread may still be busy with a shard that nobody wants.
-    runtime.shutdown_background();
-    let report = end?;
+    })?;
     let ActorReport { sessions, accepted, duplicate, rejected, failed } = report;
     tracing::info!(sessions, accepted, duplicate, rejected, failed, "stopped");
     Ok(exit::OK)

@@ -3,27 +3,26 @@
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::task::TaskConfig;
 use magex_proto::v1::ShardTiming;
-use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Metrics, Seconds};
-use std::time::Duration;
+use magex_runtime::metrics::{Gauge, GaugeVec, Histogram, IntCounter, IntCounterVec, Metrics};
 
 /// Everything that an actor counts.
 #[derive(Debug)]
 pub(crate) struct ActorGauges {
-    shards: Counters,
-    joint_steps: Counters,
-    agent_steps: Counters,
-    rollout: Seconds,
-    goals_wait: Seconds,
-    weights_wait: Seconds,
-    pub(crate) upload: Seconds,
-    pub(crate) upload_bytes: Counter,
-    pub(crate) weights_bytes: Counter,
+    shards: IntCounterVec,
+    joint_steps: IntCounterVec,
+    agent_steps: IntCounterVec,
+    rollout: Histogram,
+    goals_wait: Histogram,
+    weights_wait: Histogram,
+    pub(crate) upload: Histogram,
+    pub(crate) upload_bytes: IntCounter,
+    pub(crate) weights_bytes: IntCounter,
     pub(crate) weights_version: Gauge,
     pub(crate) connected: Gauge,
-    pub(crate) reconnects: Counter,
+    pub(crate) reconnects: IntCounter,
     pub(crate) threads: Gauge,
     pub(crate) busy: Gauge,
-    queue: Gauges,
+    queue: GaugeVec,
 }
 
 /// What became of shards; the label of a metric.
@@ -58,37 +57,36 @@ impl ActorGauges {
         OUTCOMES.iter().for_each(|outcome| gauges.shards(outcome));
         QUEUES.iter().for_each(|queue| gauges.queue(queue, 0));
         for kind in ["train", "eval"] {
-            gauges.joint_steps.with(&[kind]).add(0);
-            gauges.agent_steps.with(&[kind]).add(0);
+            gauges.joint_steps.with_label_values(&[kind]).inc_by(0);
+            gauges.agent_steps.with_label_values(&[kind]).inc_by(0);
         }
         gauges
     }
 
     /// Another shard came to this.
     pub(crate) fn outcome(&self, outcome: &str) {
-        self.shards.with(&[outcome]).add(1);
+        self.shards.with_label_values(&[outcome]).inc();
     }
 
     fn shards(&self, outcome: &str) {
-        self.shards.with(&[outcome]).add(0);
+        self.shards.with_label_values(&[outcome]).inc_by(0);
     }
 
     pub(crate) fn queue(&self, name: &str, messages: usize) {
-        self.queue.with(&[name]).set(messages as f64);
+        self.queue.with_label_values(&[name]).set(messages as f64);
     }
 
     /// A shard was rolled out.
     pub(crate) fn done(&self, shard: &Shard, task: Option<&TaskConfig>, timing: &ShardTiming) {
         self.outcome("done");
-        let time = |seconds: f64| Duration::try_from_secs_f64(seconds).unwrap_or_default();
-        self.rollout.observe(time(timing.rollout_seconds));
-        self.goals_wait.observe(time(timing.goals_wait_seconds));
-        self.weights_wait.observe(time(timing.weights_wait_seconds));
+        self.rollout.observe(timing.rollout_seconds.max(0.0));
+        self.goals_wait.observe(timing.goals_wait_seconds.max(0.0));
+        self.weights_wait.observe(timing.weights_wait_seconds.max(0.0));
         if let Some(task) = task {
             let kind = if shard.kind == ShardKind::Train { "train" } else { "eval" };
             let joint = u64::from(shard.episodes) * u64::from(task.horizon);
-            self.joint_steps.with(&[kind]).add(joint);
-            self.agent_steps.with(&[kind]).add(joint * task.agents as u64);
+            self.joint_steps.with_label_values(&[kind]).inc_by(joint);
+            self.agent_steps.with_label_values(&[kind]).inc_by(joint * task.agents as u64);
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Where a worker gets its goals from.
 
 use magex_proto::MAX_BATCH_BYTES;
-pub use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind, WeightsKey};
+pub use magex_proto::goals::{GoalReply, GoalRequest, WeightsKey};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::backoff::Backoff;

@@ -178,7 +178,7 @@ impl<'a> Link<'a> {
                     Ok(permit) => {
                         let message = self.urgent.pop_front().or_else(|| self.bulk.pop_front());
                         if let Some(Request::Part(v1::ResultPart { part: Some(part), .. })) = &message {
-                            self.gauges.upload_bytes.add(part.data.len() as u64);
+                            self.gauges.upload_bytes.inc_by(part.data.len() as u64);
                         }
                         permit.send(v1::RolloutRequest { message });
                     }
@@ -215,7 +215,7 @@ impl<'a> Link<'a> {
             }
             Response::Ack(ack) => {
                 if let Some(done) = self.unsettled.results.remove(&ack.lease_id) {
-                    self.gauges.upload.observe(done.ready.elapsed());
+                    self.gauges.upload.observe(done.ready.elapsed().as_secs_f64());
                 }
                 match ack.verdict() {
                     v1::Verdict::Accepted => {

@@ -14,7 +14,7 @@ use magex_nets::executor::{self, Input, Network};
 use magex_nets::features::{FeatureSpec, Features, JointStates, Symmetry};
 use magex_nets::ops::GraphNoise;
 use magex_nets::params::{ParamError, Params, Source, from_safetensors};
-use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind};
+use magex_proto::goals::{GoalReply, GoalRequest};
 use std::sync::Arc;
 
 /// Why a shard could not be rolled out. E is the error of whoever hands out goals.
@@ -251,7 +251,6 @@ impl JointState {
         GoalRequest {
             shard: *shard,
             seed,
-            scheduler: SchedulerKind::Learned,
             stages: stages.len(),
             agent_count: shape.agents,
             goal_count: shape.agents,

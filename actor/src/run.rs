@@ -207,7 +207,7 @@ impl Actor {
         };
         self.report.sessions += 1;
         let gauges = self.tools.gauges.clone();
-        gauges.reconnects.add(u64::from(self.report.sessions > 1));
+        gauges.reconnects.inc_by(u64::from(self.report.sessions > 1));
         let crew = self.crew_for(welcome).await?;
         gauges.connected.set(1.0);
         let link = Link::new(self.crew.insert(crew), &mut self.unsettled, &mut self.report, &gauges, outbound);

@@ -50,7 +50,7 @@ async fn watch(
         match assembler.push(message) {
             Ok(Some((weights, _))) => {
                 tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
-                gauges.weights_bytes.add(weights.bytes.len() as u64);
+                gauges.weights_bytes.inc_by(weights.bytes.len() as u64);
                 gauges.weights_version.set(f64::from(weights.version.0));
                 cache.insert(weights);
             }

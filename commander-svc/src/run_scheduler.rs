@@ -1,59 +1,69 @@
-//! The scheduler of production: the commander that a run's weights contain.
+//! The scheduler that a run's configuration names, with the run's weights.
 
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
 use crate::shard_goals::answer;
-use crate::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest};
 use magex_assign::UNASSIGNED;
-use magex_core::config::RunConfig;
+use magex_core::config::{CommanderKind, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_nets::commander::{Commander, CommanderError, Team};
+use magex_proto::convert::ConvertError;
 use std::sync::Arc;
 
-/// The commander of one version of the weights.
+/// The scheduler of one version of the weights.
 #[derive(Debug)]
-pub struct TrainedScheduler {
+pub struct RunScheduler {
     commander: Commander,
     /// `commander.random_assignment_fraction` of the run.
     random_assignment_fraction: f32,
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
-pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
-    let failed = |error: String| AssignError::Failed(error);
-    let config = RunConfig::from_toml(run_config_toml).map_err(|error| failed(error.to_string()))?;
+///
+/// # Errors
+/// The configuration or the weights are invalid.
+pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
+    let config = RunConfig::from_toml(run_config_toml).map_err(|error| SchedulerError::Load(error.to_string()))?;
     let commander = match Commander::classical(config.commander.kind) {
         Some(classical) => classical,
         None => Commander::load(&config.commander, config.task.agents, config.task.dims(), weights)
-            .map_err(|error| failed(error.to_string()))?,
+            .map_err(|error| SchedulerError::Load(error.to_string()))?,
     };
-    Ok(Arc::new(TrainedScheduler {
-        commander,
-        random_assignment_fraction: config.commander.random_assignment_fraction,
-    }))
+    Ok(Arc::new(RunScheduler { commander, random_assignment_fraction: config.commander.random_assignment_fraction }))
 }
 
-impl Scheduler for TrainedScheduler {
-    fn assign_batch(&self, request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
-        answer(&self.commander, self.random_assignment_fraction, request, go_on).map_err(|error| match error {
-            CommanderError::Instance(problem) => AssignError::Invalid { field: "agents".to_owned(), problem },
-            CommanderError::Interrupted => AssignError::Interrupted,
-            other => AssignError::Failed(other.to_string()),
-        })
+impl Scheduler for RunScheduler {
+    fn assign_batch(
+        &self,
+        request: &GoalRequest,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<GoalReply, SchedulerError> {
+        answer(&self.commander, self.random_assignment_fraction, request, should_continue).map_err(
+            |error| match error {
+                CommanderError::Instance(problem) => SchedulerError::Invalid(ConvertError::new("agents", problem)),
+                CommanderError::Interrupted => SchedulerError::Interrupted,
+                other => SchedulerError::Compute(other.to_string()),
+            },
+        )
     }
 
-    fn teams(&self) -> bool {
-        self.commander.kind().learned()
+    fn method(&self) -> AssignmentMethod {
+        match self.commander.kind() {
+            CommanderKind::Exact => AssignmentMethod::Exact,
+            CommanderKind::Random => AssignmentMethod::Random,
+            CommanderKind::Pairwise | CommanderKind::Ranking => AssignmentMethod::Learned,
+        }
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
-        if !self.teams() {
-            return Err(AssignError::Unsupported("the run has no learned commander".to_owned()));
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+        if self.method() != AssignmentMethod::Learned {
+            return Err(SchedulerError::Unsupported("the run has no learned scheduler".to_owned()));
         }
         let team = Team { agents: &request.agents, goals: &request.goals, dims: request.dims };
         let mut stream = Key::new(request.seed, Purpose::Request, &[]).stream();
         let decision = self
             .commander
             .assign(&team, request.mode, &mut stream)
-            .map_err(|error| AssignError::Unsupported(error.to_string()))?;
+            .map_err(|error| SchedulerError::Unsupported(error.to_string()))?;
         let goals = decision.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
         Ok(TeamReply { goals, probabilities: Some(decision.probabilities) })
     }

@@ -1,5 +1,5 @@
 //! What every service shares and no domain type: the path of a call ([`net`]), servers, clients, TLS, health and retries; logs,
-//! traces and metrics; the start and the end of a process.
+//! traces and metrics; the start and the end of a process ([`service`]).
 
 pub mod backoff;
 pub mod client;
@@ -11,6 +11,7 @@ pub mod net;
 pub mod process;
 pub mod security;
 pub mod server;
+pub mod service;
 pub mod shutdown;
 pub mod status;
 pub mod sync;

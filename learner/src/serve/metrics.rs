@@ -5,7 +5,9 @@ use crate::report::metrics_file::IterationMetrics;
 use crate::serve::ledger;
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
-use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Held, Metrics, Seconds, SecondsBy};
+use magex_runtime::metrics::{
+    Gauge, GaugeGuard, GaugeVec, Histogram, HistogramVec, IntCounter, IntCounterVec, Metrics, raise_to,
+};
 use std::time::Duration;
 
 /// Everything that the learner counts.
@@ -13,28 +15,28 @@ use std::time::Duration;
 pub(crate) struct LearnerGauges {
     shards: Fates,
     episodes: Fates,
-    pub(crate) received_bytes: Counter,
-    joint_steps: Counter,
-    agent_steps: Counter,
+    pub(crate) received_bytes: IntCounter,
+    joint_steps: IntCounter,
+    agent_steps: IntCounter,
     pub(crate) actors_live: Gauge,
     pub(crate) actors_expected: Gauge,
     pub(crate) actor_threads: Gauge,
-    sessions_ended: Counters,
-    queue: Gauges,
-    policy_lag: Gauges,
-    sample_age: Gauges,
-    iterations: Counter,
-    phase: SecondsBy,
-    bound: Counters,
-    bound_seconds: Gauges,
+    sessions_ended: IntCounterVec,
+    queue: GaugeVec,
+    policy_lag: GaugeVec,
+    sample_age: GaugeVec,
+    iterations: IntCounter,
+    phase: HistogramVec,
+    bound: IntCounterVec,
+    bound_seconds: GaugeVec,
     pub(crate) weights_version: Gauge,
     pub(crate) weights_bytes: Gauge,
-    pub(crate) weights_published: Seconds,
-    subscribers: Gauges,
-    checkpoint: Seconds,
+    pub(crate) weights_published: Histogram,
+    subscribers: GaugeVec,
+    checkpoint: Histogram,
     checkpoint_bytes: Gauge,
-    checkpoint_failures: Counter,
-    skipped: Counter,
+    checkpoint_failures: IntCounter,
+    skipped: IntCounter,
     success: Gauge,
     reward: Gauge,
 }
@@ -100,14 +102,14 @@ impl LearnerGauges {
                 .gauge("magex_learner_reward_mean", "Mean reward per agent and step of the latest training episodes."),
         };
         // A scrape shows all of them from the start.
-        ENDS.iter().for_each(|reason| gauges.sessions_ended.with(&[reason]).add(0));
-        PHASES.iter().for_each(|phase| drop(gauges.phase.with(&[phase])));
+        ENDS.iter().for_each(|reason| gauges.sessions_ended.with_label_values(&[reason]).inc_by(0));
+        PHASES.iter().for_each(|phase| drop(gauges.phase.with_label_values(&[phase])));
         for by in BoundBy::ALL {
-            gauges.bound.with(&[by.name()]).add(0);
-            gauges.bound_seconds.with(&[by.name()]).set(0.0);
+            gauges.bound.with_label_values(&[by.name()]).inc_by(0);
+            gauges.bound_seconds.with_label_values(&[by.name()]).set(0.0);
         }
         for role in [SubscriberRole::Actor, SubscriberRole::Commander, SubscriberRole::Observer] {
-            gauges.subscribers.with(&[role_name(role)]).set(0.0);
+            gauges.subscribers.with_label_values(&[role_name(role)]).set(0.0);
         }
         set_stats(&gauges.policy_lag, &[]);
         set_stats(&gauges.sample_age, &[]);
@@ -122,21 +124,21 @@ impl LearnerGauges {
     }
 
     pub(crate) fn queue(&self, name: &str, messages: usize) {
-        self.queue.with(&[name]).set(messages as f64);
+        self.queue.with_label_values(&[name]).set(messages as f64);
     }
 
     pub(crate) fn session_ended(&self, reason: &str) {
-        self.sessions_ended.with(&[reason]).add(1);
+        self.sessions_ended.with_label_values(&[reason]).inc();
     }
 
-    pub(crate) fn subscriber(&self, role: SubscriberRole) -> Held {
-        self.subscribers.with(&[role_name(role)]).hold()
+    pub(crate) fn subscriber(&self, role: SubscriberRole) -> GaugeGuard {
+        GaugeGuard::new(self.subscribers.with_label_values(&[role_name(role)]))
     }
 
     /// A result with so many joint steps and agent steps was taken into the batch.
     pub(crate) fn accepted(&self, (joint, agent): (u64, u64)) {
-        self.joint_steps.add(joint);
-        self.agent_steps.add(agent);
+        self.joint_steps.inc_by(joint);
+        self.agent_steps.inc_by(agent);
     }
 
     /// The batch is complete.
@@ -148,18 +150,18 @@ impl LearnerGauges {
     /// An iteration is complete.
     pub(crate) fn iteration(&self, metrics: &IterationMetrics) {
         let timing = &metrics.timing;
-        self.iterations.add(u64::from(metrics.executor.is_some()));
+        self.iterations.inc_by(u64::from(metrics.executor.is_some()));
         let spent = [timing.publish_s, timing.collect_s, timing.executor_s, timing.commander_s, timing.checkpoint_s];
         for (phase, seconds) in PHASES.iter().zip(spent) {
-            self.phase.with(&[phase]).observe(Duration::from_secs_f64(seconds.max(0.0)));
+            self.phase.with_label_values(&[phase]).observe(seconds.max(0.0));
         }
         let bound = &timing.bound;
-        self.bound.with(&[bound.by.name()]).add(1);
+        self.bound.with_label_values(&[bound.by.name()]).inc();
         for (by, seconds) in BoundBy::ALL.iter().zip([bound.actor_s, bound.learner_s, bound.network_s]) {
-            self.bound_seconds.with(&[by.name()]).set(seconds);
+            self.bound_seconds.with_label_values(&[by.name()]).set(seconds);
         }
         if let Some(update) = &metrics.executor {
-            self.skipped.add(update.skipped as u64);
+            self.skipped.inc_by(update.skipped as u64);
         }
         if let Some(success) = metrics.success_rate {
             self.success.set(success);
@@ -171,10 +173,10 @@ impl LearnerGauges {
 
     /// A checkpoint was written, with so many bytes, or could not be.
     pub(crate) fn checkpoint(&self, took: Duration, bytes: Option<u64>) {
-        self.checkpoint.observe(took);
+        self.checkpoint.observe(took.as_secs_f64());
         match bytes {
             Some(bytes) => self.checkpoint_bytes.set(bytes as f64),
-            None => self.checkpoint_failures.add(1),
+            None => self.checkpoint_failures.inc(),
         }
     }
 }
@@ -182,7 +184,7 @@ impl LearnerGauges {
 /// The conservation ledger, of shards or of episodes.
 #[derive(Debug)]
 struct Fates {
-    counters: [Counter; 6],
+    counters: [IntCounter; 6],
     outstanding: Gauge,
     residual: Gauge,
 }
@@ -207,7 +209,7 @@ impl Fates {
 
     fn set(&self, c: &ledger::Counters) {
         let totals = [c.leased, c.trained, c.duplicate, c.expired, c.rejected, c.failed];
-        self.counters.iter().zip(totals).for_each(|(counter, total)| counter.raise_to(total));
+        self.counters.iter().zip(totals).for_each(|(counter, total)| raise_to(counter, total));
         self.outstanding.set(c.outstanding as f64);
         self.residual.set(c.residual() as f64);
     }
@@ -230,11 +232,11 @@ fn role_name(role: SubscriberRole) -> &'static str {
 }
 
 /// Smallest, mean and largest; zeros of nothing.
-fn set_stats(gauges: &Gauges, values: &[f64]) {
+fn set_stats(gauges: &GaugeVec, values: &[f64]) {
     let count = values.len().max(1) as f64;
     let smallest = values.iter().copied().reduce(f64::min).unwrap_or(0.0);
     let largest = values.iter().copied().reduce(f64::max).unwrap_or(0.0);
     for (stat, value) in [("min", smallest), ("mean", values.iter().sum::<f64>() / count), ("max", largest)] {
-        gauges.with(&[stat]).set(value);
+        gauges.with_label_values(&[stat]).set(value);
     }
 }

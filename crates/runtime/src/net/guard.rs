@@ -1,75 +1,115 @@
-//! What stands before a service: who calls, how much it has in flight already, how much is on its way. All of that is known
-//! from a call's headers and from the length that a message announces, before anything of it is decoded.
+//! The layer in front of a service: it authenticates a call, counts what the caller has in flight, and counts messages while
+//! they arrive. It decides from the headers of a call and the announced length of a message, before anything is decoded.
 
 mod truncate_status;
 
-use crate::net::auth::{Access, Caller, Role};
-use crate::net::in_flight::{Admission, Kind, Slot};
+use crate::net::auth::{Access, Caller, Role, peer_address};
 use crate::net::connections::Connections;
+use crate::net::in_flight::{CallKind, InFlight, Permit};
 use http_body::{Frame, SizeHint};
 use std::convert::Infallible;
 use std::future::Future;
-use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 use tokio::time::Sleep;
+use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::{Service, http};
-use tonic::metadata::MetadataMap;
 use tonic::server::NamedService;
-use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo};
-use tonic::{Request, Status};
+use truncate_status::truncate_status;
 
-/// How long a message of a stream may take from its first byte to its last, and the whole request of a call.
+/// Timeout of a message of a stream, from its first byte to its last, and of the whole request of a unary call.
 const MESSAGE: Duration = Duration::from_secs(30);
 
-/// Bytes before every message: whether it is compressed, and its length.
+/// Bytes before every message: a compression flag and the length.
 const PREFIX: usize = 5;
 
-/// Longest message to a service without a door, bytes: the name of a service or of a symbol.
-const GUEST_MESSAGE: usize = 4096;
+/// Longest message to a public service, bytes: the name of a service or of a symbol.
+const ANONYMOUS_MESSAGE: usize = 4096;
 
-/// Methods of services without a door that stay open.
-const GUEST_STREAMS: &[&str] = &["Watch", "ServerReflectionInfo"];
+/// Streaming methods of public services.
+const ANONYMOUS_STREAMS: &[&str] = &["Watch", "ServerReflectionInfo"];
 
-/// The rules of a door.
+/// The rules of a guarded service.
 #[derive(Debug)]
 pub struct Rules {
-    /// Who is let in.
+    /// The identities that may call.
     pub access: Access,
-    /// How much everybody may have in flight.
-    pub admission: Arc<Admission>,
-    /// Methods that stay open.
+    /// Limits of what callers have in flight.
+    pub in_flight: Arc<InFlight>,
+    /// Streaming methods.
     pub streams: &'static [&'static str],
-    /// Longest message, bytes; the service refuses longer ones.
+    /// Longest message, bytes; the service itself rejects longer ones.
     pub message_bytes: usize,
-    /// Where calls come in.
-    pub connections: Connections,
 }
 
-/// A service behind a door.
+/// Which calls a [`Guard`] accepts.
+#[derive(Debug)]
+enum Policy {
+    /// Calls with credentials, within the caller's limits.
+    Guarded(Rules),
+    /// Calls of any client (health, reflection), within limits per address, also while the service drains.
+    Public,
+}
+
+/// A service behind a guard.
 #[derive(Debug, Clone)]
-pub struct Door<S> {
+pub struct Guard<S> {
     service: S,
-    rules: Arc<Rules>,
+    policy: Arc<Policy>,
+    connections: Connections,
 }
 
-impl<S> Door<S> {
-    /// Puts a door before a service.
-    pub fn new(service: S, rules: Rules) -> Self {
-        Self { service, rules: Arc::new(rules) }
+impl<S> Guard<S> {
+    /// Requires credentials and enforces the limits of `rules`.
+    pub fn guarded(service: S, rules: Rules, connections: Connections) -> Self {
+        Self { service, policy: Arc::new(Policy::Guarded(rules)), connections }
+    }
+
+    /// Accepts any client, within small limits per address.
+    pub fn public(service: S, connections: Connections) -> Self {
+        Self { service, policy: Arc::new(Policy::Public), connections }
+    }
+
+    fn admit(&self, mut request: http::Request<Body>) -> Result<(http::Request<Body>, Arc<Permit>), Status> {
+        let address = peer_address(request.extensions());
+        let (permit, kind, limit) = match &*self.policy {
+            Policy::Guarded(rules) => {
+                let caller = rules.access.authenticate(&request)?;
+                if let Some(address) = address {
+                    self.connections.called(address);
+                }
+                let kind = kind(request.uri(), rules.streams);
+                let permit = rules.in_flight.acquire(&caller, kind)?;
+                request.extensions_mut().insert(caller);
+                (permit, kind, Limit { bytes: rules.message_bytes, strict: false })
+            }
+            Policy::Public => {
+                if let Some(address) = address {
+                    self.connections.probed(address);
+                }
+                let name = address.map_or_else(|| "local".to_owned(), |address| address.ip().to_string());
+                let caller = Caller { name: name.into(), role: Role::Client };
+                let kind = kind(request.uri(), ANONYMOUS_STREAMS);
+                let permit = self.connections.anonymous().acquire(&caller, kind)?;
+                (permit, kind, Limit { bytes: ANONYMOUS_MESSAGE, strict: true })
+            }
+        };
+        let permit = Arc::new(permit);
+        let metered = permit.clone();
+        Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, limit))), permit))
     }
 }
 
-impl<S: NamedService> NamedService for Door<S> {
+impl<S: NamedService> NamedService for Guard<S> {
     const NAME: &'static str = S::NAME;
 }
 
 type Answer = Pin<Box<dyn Future<Output = Result<http::Response<Body>, Infallible>> + Send>>;
 
-impl<S> Service<http::Request<Body>> for Door<S>
+impl<S> Service<http::Request<Body>> for Guard<S>
 where
     S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
     S::Future: Send + 'static,
@@ -83,134 +123,52 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        match self.rules.admit(request) {
-            Ok((request, slot)) => held(self.service.call(request), slot),
-            Err(status) => Box::pin(std::future::ready(Ok(status.into_http()))),
-        }
+        let (request, permit) = match self.admit(request) {
+            Ok(admitted) => admitted,
+            Err(status) => return Box::pin(std::future::ready(Ok(status.into_http()))),
+        };
+        let answer = self.service.call(request);
+        Box::pin(async move {
+            let mut response = answer.await?;
+            truncate_status(response.headers_mut());
+            Ok(response.map(|body| Body::new(Permitted { body, _permit: permit })))
+        })
     }
 }
 
-/// An answer that is short where it says what went wrong, and that keeps its place until it, or the last of a stream of them,
-/// is on its way.
-fn held(
-    answer: impl Future<Output = Result<http::Response<Body>, Infallible>> + Send + 'static,
-    slot: Arc<Slot>,
-) -> Answer {
-    Box::pin(async move {
-        let mut response = answer.await?;
-        truncate_status::truncate_status(response.headers_mut());
-        Ok(response.map(|body| Body::new(Held { body, _slot: slot })))
-    })
-}
-
-impl Rules {
-    fn admit(&self, request: http::Request<Body>) -> Result<(http::Request<Body>, Arc<Slot>), Status> {
-        let (mut parts, body) = request.into_parts();
-        let headers = std::mem::take(&mut parts.headers);
-        let mut request =
-            Request::from_parts(MetadataMap::from_headers(headers), std::mem::take(&mut parts.extensions), ());
-        let caller = self.access.identify(&request)?;
-        // Only who is known has a connection for as long as it likes.
-        if let Some(address) = peer(request.extensions()) {
-            self.connections.called(address);
-        }
-        let kind = kind(&parts.uri, self.streams);
-        let slot = Arc::new(self.admission.enter(&caller, kind)?);
-        request.extensions_mut().insert(caller);
-        let (metadata, extensions, ()) = request.into_parts();
-        (parts.headers, parts.extensions) = (metadata.into_headers(), extensions);
-        let body = Metered::new(body, slot.clone(), kind, self.message_bytes, false);
-        Ok((http::Request::from_parts(parts, Body::new(body)), slot))
-    }
-}
-
-fn kind(uri: &http::Uri, streams: &[&str]) -> Kind {
+fn kind(uri: &http::Uri, streams: &[&str]) -> CallKind {
     let method = uri.path().rsplit('/').next().unwrap_or_default();
-    if streams.contains(&method) { Kind::Stream } else { Kind::Call }
+    if streams.contains(&method) { CallKind::Stream } else { CallKind::Call }
 }
 
-/// Where a call comes from.
-fn peer(extensions: &http::Extensions) -> Option<SocketAddr> {
-    let plain = extensions.get::<TcpConnectInfo>();
-    let info = plain.or_else(|| extensions.get::<TlsConnectInfo<TcpConnectInfo>>().map(TlsConnectInfo::get_ref));
-    info.and_then(TcpConnectInfo::remote_addr)
-}
-
-/// A service without a door (health, reflection): anybody may call, each address a little, also while the others are full or
-/// the service drains.
-#[derive(Debug, Clone)]
-pub struct Open<S> {
-    service: S,
-    connections: Connections,
-}
-
-impl<S> Open<S> {
-    /// Anybody may call.
-    pub fn new(service: S, connections: Connections) -> Self {
-        Self { service, connections }
-    }
-
-    fn admit(&self, request: http::Request<Body>) -> Result<(http::Request<Body>, Arc<Slot>), Status> {
-        let address = peer(request.extensions());
-        if let Some(address) = address {
-            self.connections.probed(address);
-        }
-        let name = address.map_or_else(|| "local".to_owned(), |address| address.ip().to_string());
-        let guest = Caller { name: name.into(), role: Role::Client };
-        let kind = kind(request.uri(), GUEST_STREAMS);
-        let slot = Arc::new(self.connections.guests().enter(&guest, kind)?);
-        let metered = slot.clone();
-        Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, GUEST_MESSAGE, true))), slot))
-    }
-}
-
-impl<S: NamedService> NamedService for Open<S> {
-    const NAME: &'static str = S::NAME;
-}
-
-impl<S> Service<http::Request<Body>> for Open<S>
-where
-    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
-    S::Future: Send + 'static,
-{
-    type Response = http::Response<Body>;
-    type Error = Infallible;
-    type Future = Answer;
-
-    fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
-        self.service.poll_ready(cx)
-    }
-
-    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        match self.admit(request) {
-            Ok((request, slot)) => held(self.service.call(request), slot),
-            Err(status) => Box::pin(std::future::ready(Ok(status.into_http()))),
-        }
-    }
+/// The limit of a message's length.
+#[derive(Debug, Clone, Copy)]
+struct Limit {
+    bytes: usize,
+    /// Longer messages are rejected here. Otherwise the service rejects them itself, without buffering them.
+    strict: bool,
 }
 
 /// A request's body whose messages are counted while they arrive.
 struct Metered {
     body: Body,
-    slot: Arc<Slot>,
-    limit: usize,
-    /// Longer messages are refused here; otherwise the service has words of its own for them, and keeps nothing of them.
-    strict: bool,
+    permit: Arc<Permit>,
+    limit: Limit,
+    kind: CallKind,
     prefix: [u8; PREFIX],
-    /// Bytes of the prefix that are known, and bytes of the message that are still to come.
+    /// Bytes of the prefix that have arrived, and bytes of the message that have not.
     known: usize,
     rest: usize,
-    kind: Kind,
-    /// Something has to come in time.
-    begun: bool,
-    patience: Option<Pin<Box<Sleep>>>,
+    /// The next bytes must arrive within [`MESSAGE`].
+    timed: bool,
+    timeout: Option<Pin<Box<Sleep>>>,
 }
 
 impl Metered {
-    fn new(body: Body, slot: Arc<Slot>, kind: Kind, limit: usize, strict: bool) -> Self {
-        // A stream may begin, and go on, with silence.
-        let begun = kind == Kind::Call;
-        Self { body, slot, limit, strict, prefix: [0; PREFIX], known: 0, rest: 0, kind, begun, patience: None }
+    fn new(body: Body, permit: Arc<Permit>, kind: CallKind, limit: Limit) -> Self {
+        // A stream may be silent before and between messages.
+        let timed = kind == CallKind::Call;
+        Self { body, permit, limit, kind, prefix: [0; PREFIX], known: 0, rest: 0, timed, timeout: None }
     }
 
     fn count(&mut self, mut data: &[u8]) -> Result<(), Status> {
@@ -219,8 +177,8 @@ impl Metered {
                 let step = self.rest.min(data.len());
                 (self.rest, data) = (self.rest - step, &data[step..]);
                 if self.rest == 0 {
-                    // The next one has its own time.
-                    self.patience = None;
+                    // The next message has its own timeout.
+                    self.timeout = None;
                 }
             } else {
                 let step = (PREFIX - self.known).min(data.len());
@@ -229,21 +187,23 @@ impl Metered {
                 if self.known == PREFIX {
                     let [_, a, b, c, d] = self.prefix;
                     (self.known, self.rest) = (0, u32::from_be_bytes([a, b, c, d]) as usize);
-                    if self.rest <= self.limit {
-                        self.slot.announce(self.rest)?;
-                    } else if self.strict {
-                        let problem = format!("a message of {} bytes; at most {} are read here", self.rest, self.limit);
-                        return Err(Status::out_of_range(problem));
+                    if self.rest <= self.limit.bytes {
+                        self.permit.reserve(self.rest)?;
+                    } else if self.limit.strict {
+                        let (length, limit) = (self.rest, self.limit.bytes);
+                        return Err(Status::out_of_range(format!(
+                            "message of {length} bytes exceeds the limit of {limit}"
+                        )));
                     }
                     if self.rest == 0 {
-                        self.patience = None;
+                        self.timeout = None;
                     }
                 }
             }
         }
-        self.begun = self.kind == Kind::Call || self.rest > 0 || self.known > 0;
-        if !self.begun {
-            self.patience = None;
+        self.timed = self.kind == CallKind::Call || self.rest > 0 || self.known > 0;
+        if !self.timed {
+            self.timeout = None;
         }
         Ok(())
     }
@@ -263,9 +223,9 @@ impl http_body::Body for Metered {
                     return Poll::Ready(Some(Err(status)));
                 }
             }
-            Poll::Pending if self.begun => {
-                let patience = self.patience.get_or_insert_with(|| Box::pin(tokio::time::sleep(MESSAGE)));
-                if patience.as_mut().poll(cx).is_ready() {
+            Poll::Pending if self.timed => {
+                let timeout = self.timeout.get_or_insert_with(|| Box::pin(tokio::time::sleep(MESSAGE)));
+                if timeout.as_mut().poll(cx).is_ready() {
                     let problem = format!("the message did not arrive within {} s", MESSAGE.as_secs());
                     return Poll::Ready(Some(Err(Status::deadline_exceeded(problem))));
                 }
@@ -284,13 +244,13 @@ impl http_body::Body for Metered {
     }
 }
 
-/// An answer's body that holds its place.
-struct Held {
+/// A response's body that holds the permit until its last frame is sent.
+struct Permitted {
     body: Body,
-    _slot: Arc<Slot>,
+    _permit: Arc<Permit>,
 }
 
-impl http_body::Body for Held {
+impl http_body::Body for Permitted {
     type Data = tonic::codegen::Bytes;
     type Error = Status;
 
@@ -299,7 +259,7 @@ impl http_body::Body for Held {
         if let Poll::Ready(Some(Ok(frame))) = &mut next
             && let Some(trailers) = frame.trailers_mut()
         {
-            truncate_status::truncate_status(trailers);
+            truncate_status(trailers);
         }
         next
     }

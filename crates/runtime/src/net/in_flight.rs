@@ -1,4 +1,4 @@
-//! Who is let in now: nobody while the service drains, and nobody with too much in flight already.
+//! Limits of what each caller, and all callers together, have in flight; while the service drains every call is rejected.
 
 use crate::net::auth::Caller;
 use crate::status;
@@ -8,79 +8,80 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// When to come back to a service that has too much to do.
+/// Retry delay when a limit is reached.
 const BUSY: Duration = Duration::from_millis(100);
-/// When to come back to a service that stops; another may have taken its place by then.
+/// Retry delay while the service stops; by then another instance may have replaced it.
 const STOPPING: Duration = Duration::from_secs(1);
 
-/// What a caller holds.
+/// The two kinds of calls, which have limits of their own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    /// A request until its answer.
+pub enum CallKind {
+    /// Unary: counted until its response is sent.
     Call,
-    /// A stream that stays open.
+    /// Streaming: counted until the stream closes.
     Stream,
 }
 
-/// How much may be in flight.
+/// Limits of what may be in flight.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FlightLimits {
-    /// Calls of one caller.
+pub struct InFlightLimits {
+    /// Unary calls of one caller.
     pub calls: usize,
     /// Open streams of one caller.
     pub streams: usize,
-    /// Bytes of messages of one caller.
+    /// Bytes of request messages of one caller.
     pub caller_bytes: usize,
-    /// Bytes of messages of everybody.
+    /// Bytes of request messages of all callers.
     pub bytes: usize,
 }
 
 /// Counts what every caller has in flight.
 #[derive(Debug)]
-pub struct Admission {
-    flights: Mutex<Flights>,
-    limits: FlightLimits,
+pub struct InFlight {
+    usage: Mutex<Usage>,
+    limits: InFlightLimits,
     draining: CancellationToken,
 }
 
 #[derive(Debug, Default)]
-struct Flights {
-    held: HashMap<Arc<str>, Held>,
+struct Usage {
+    callers: HashMap<Arc<str>, CallerUsage>,
     bytes: usize,
 }
 
 #[derive(Debug, Default, PartialEq, Eq)]
-struct Held {
-    /// Calls, streams.
+struct CallerUsage {
+    /// Unary calls, streams: by [`CallKind`].
     counts: [usize; 2],
     bytes: usize,
 }
 
-impl Admission {
-    /// Lets calls in until `draining` is cancelled.
-    pub fn new(limits: FlightLimits, draining: CancellationToken) -> Arc<Self> {
-        Arc::new(Self { flights: Mutex::default(), limits, draining })
+impl InFlight {
+    /// Accepts calls until `draining` is cancelled.
+    pub fn new(limits: InFlightLimits, draining: CancellationToken) -> Arc<Self> {
+        Arc::new(Self { usage: Mutex::default(), limits, draining })
     }
 
-    /// Lets one more in, until the slot is dropped.
+    /// Counts one more call, until the permit is dropped.
     ///
     /// # Errors
-    /// RESOURCE_EXHAUSTED: the caller has as much in flight as it may. UNAVAILABLE: the service drains.
-    pub fn enter(self: &Arc<Self>, caller: &Caller, kind: Kind) -> Result<Slot, Status> {
+    /// RESOURCE_EXHAUSTED: the caller is at its limit. UNAVAILABLE: the service drains.
+    pub fn acquire(self: &Arc<Self>, caller: &Caller, kind: CallKind) -> Result<Permit, Status> {
         self.check_open()?;
-        let limit = if kind == Kind::Call { self.limits.calls } else { self.limits.streams };
-        let mut flights = self.lock();
-        let count = &mut flights.held.entry(caller.name.clone()).or_default().counts[kind as usize];
+        let limit = if kind == CallKind::Call { self.limits.calls } else { self.limits.streams };
+        let mut usage = self.lock();
+        let count = &mut usage.callers.entry(caller.name.clone()).or_default().counts[kind as usize];
         if *count >= limit {
-            let what = if kind == Kind::Call { "calls in flight" } else { "open streams" };
-            return Err(status::resource_exhausted(format!("'{}' has {limit} {what} already", caller.name), BUSY));
+            let what = if kind == CallKind::Call { "calls in flight" } else { "open streams" };
+            let problem = format!("caller '{}' is at its limit of {limit} {what}; retry later", caller.name);
+            return Err(status::resource_exhausted(problem, BUSY));
         }
         *count += 1;
-        drop(flights);
-        Ok(Slot { admission: self.clone(), name: caller.name.clone(), kind, bytes: Mutex::new(0) })
+        drop(usage);
+        Ok(Permit { in_flight: self.clone(), name: caller.name.clone(), kind, bytes: Mutex::new(0) })
     }
 
-    /// Refuses when the service drains.
+    /// Rejects calls while the service drains.
     ///
     /// # Errors
     /// UNAVAILABLE.
@@ -88,68 +89,73 @@ impl Admission {
         if self.draining.is_cancelled() { Err(stopping()) } else { Ok(()) }
     }
 
-    /// What everybody holds of a kind.
-    pub fn count(&self, kind: Kind) -> usize {
-        self.lock().held.values().map(|held| held.counts[kind as usize]).sum()
+    /// Calls of a kind in flight, of all callers.
+    pub fn count(&self, kind: CallKind) -> usize {
+        self.lock().callers.values().map(|caller| caller.counts[kind as usize]).sum()
     }
 
-    fn lock(&self) -> MutexGuard<'_, Flights> {
+    fn lock(&self) -> MutexGuard<'_, Usage> {
         // Counting cannot fail half-way.
-        self.flights.lock().unwrap_or_else(PoisonError::into_inner)
+        self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// What a stream ends with when the service drains.
+/// The status that ends streams when the service drains.
 pub fn stopping() -> Status {
     status::unavailable("the service is stopping", STOPPING)
 }
 
-/// A place; free again when dropped.
+/// One call in flight; released when dropped.
 #[derive(Debug)]
-pub struct Slot {
-    admission: Arc<Admission>,
+pub struct Permit {
+    in_flight: Arc<InFlight>,
     name: Arc<str>,
-    kind: Kind,
-    /// Of the message that is on its way or at work.
+    kind: CallKind,
+    /// Length of the message that arrives or is processed.
     bytes: Mutex<usize>,
 }
 
-impl Slot {
-    /// A message of this length begins to arrive, in place of the one before it.
+impl Permit {
+    /// Counts a message of this length, which replaces the previous message of the call.
     ///
     /// # Errors
-    /// RESOURCE_EXHAUSTED: so much is on its way already.
-    pub fn announce(&self, length: usize) -> Result<(), Status> {
+    /// RESOURCE_EXHAUSTED: the bytes in flight would exceed a limit.
+    pub fn reserve(&self, length: usize) -> Result<(), Status> {
         let mut own = self.bytes.lock().unwrap_or_else(PoisonError::into_inner);
-        let limits = &self.admission.limits;
-        let mut flights = self.admission.lock();
+        let limits = &self.in_flight.limits;
+        let mut usage = self.in_flight.lock();
         let before = std::mem::take(&mut *own);
-        flights.bytes -= before;
-        let all = flights.bytes + length;
-        let held = flights.held.entry(self.name.clone()).or_default();
-        held.bytes -= before;
-        if held.bytes + length > limits.caller_bytes || all > limits.bytes {
-            let whose = if all > limits.bytes { "everybody" } else { &*self.name };
-            let problem = format!("{length} bytes are more than there is room for beside what '{whose}' has in flight");
+        usage.bytes -= before;
+        let all = usage.bytes + length;
+        let caller = usage.callers.entry(self.name.clone()).or_default();
+        caller.bytes -= before;
+        if caller.bytes + length > limits.caller_bytes || all > limits.bytes {
+            let (whose, used, limit) = match all > limits.bytes {
+                true => ("of all callers".to_owned(), all - length, limits.bytes),
+                false => (format!("of caller '{}'", self.name), caller.bytes, limits.caller_bytes),
+            };
+            let problem = format!(
+                "message of {length} bytes exceeds the in-flight budget {whose} ({used} of {limit} bytes used)"
+            );
             return Err(status::resource_exhausted(problem, BUSY));
         }
-        held.bytes += length;
-        flights.bytes = all;
+        caller.bytes += length;
+        usage.bytes = all;
         *own = length;
         Ok(())
     }
 }
 
-impl Drop for Slot {
+impl Drop for Permit {
     fn drop(&mut self) {
         let own = *self.bytes.get_mut().unwrap_or_else(PoisonError::into_inner);
-        let mut flights = self.admission.lock();
-        flights.bytes -= own;
-        if let Some(held) = flights.held.get_mut(&self.name) {
-            held.counts[self.kind as usize] = held.counts[self.kind as usize].saturating_sub(1);
-            held.bytes -= own;
-            if *held == Held::default() {
-                flights.held.remove(&self.name);
+        let mut usage = self.in_flight.lock();
+        usage.bytes -= own;
+        if let Some(caller) = usage.callers.get_mut(&self.name) {
+            caller.counts[self.kind as usize] = caller.counts[self.kind as usize].saturating_sub(1);
+            caller.bytes -= own;
+            if *caller == CallerUsage::default() {
+                usage.callers.remove(&self.name);
             }
         }
     }
@@ -164,42 +170,42 @@ mod tests {
         Caller { name: name.into(), role: Role::Client }
     }
 
-    const LIMITS: FlightLimits = FlightLimits { calls: 2, streams: 1, caller_bytes: 100, bytes: 150 };
+    const LIMITS: InFlightLimits = InFlightLimits { calls: 2, streams: 1, caller_bytes: 100, bytes: 150 };
 
     #[test]
-    fn places_are_counted_per_caller_and_come_back() {
+    fn permits_are_counted_per_caller_and_released() {
         let draining = CancellationToken::new();
-        let admission = Admission::new(LIMITS, draining.clone());
-        let first = admission.enter(&caller("a"), Kind::Call).unwrap();
-        let _second = admission.enter(&caller("a"), Kind::Call).unwrap();
-        let refused = admission.enter(&caller("a"), Kind::Call).unwrap_err();
+        let in_flight = InFlight::new(LIMITS, draining.clone());
+        let first = in_flight.acquire(&caller("a"), CallKind::Call).unwrap();
+        let _second = in_flight.acquire(&caller("a"), CallKind::Call).unwrap();
+        let refused = in_flight.acquire(&caller("a"), CallKind::Call).unwrap_err();
         assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
         assert!(status::retry_delay(&refused).is_some());
-        let _other = admission.enter(&caller("b"), Kind::Call).unwrap();
-        let _stream = admission.enter(&caller("a"), Kind::Stream).unwrap();
-        assert!(admission.enter(&caller("a"), Kind::Stream).is_err());
+        let _other = in_flight.acquire(&caller("b"), CallKind::Call).unwrap();
+        let _stream = in_flight.acquire(&caller("a"), CallKind::Stream).unwrap();
+        assert!(in_flight.acquire(&caller("a"), CallKind::Stream).is_err());
         drop(first);
-        let _third = admission.enter(&caller("a"), Kind::Call).unwrap();
-        assert_eq!(admission.count(Kind::Call), 3);
+        let _third = in_flight.acquire(&caller("a"), CallKind::Call).unwrap();
+        assert_eq!(in_flight.count(CallKind::Call), 3);
         draining.cancel();
-        assert_eq!(admission.enter(&caller("c"), Kind::Call).unwrap_err().code(), tonic::Code::Unavailable);
+        assert_eq!(in_flight.acquire(&caller("c"), CallKind::Call).unwrap_err().code(), tonic::Code::Unavailable);
     }
 
     #[test]
-    fn bytes_are_counted_from_their_announcement() {
-        let admission = Admission::new(LIMITS, CancellationToken::new());
-        let enter = |name| admission.enter(&caller(name), Kind::Call).unwrap();
-        let (a, second, b) = (enter("a"), enter("a"), enter("b"));
-        a.announce(60).unwrap();
-        let refused = second.announce(41).unwrap_err();
+    fn bytes_are_counted_before_they_arrive() {
+        let in_flight = InFlight::new(LIMITS, CancellationToken::new());
+        let acquire = |name| in_flight.acquire(&caller(name), CallKind::Call).unwrap();
+        let (a, second, b) = (acquire("a"), acquire("a"), acquire("b"));
+        a.reserve(60).unwrap();
+        let refused = second.reserve(41).unwrap_err();
         assert!(status::retry_delay(&refused).is_some() && refused.message().contains("'a'"), "{refused}");
-        second.announce(40).unwrap();
-        assert!(b.announce(51).unwrap_err().message().contains("'everybody'"));
-        // The next message of a stream takes the place of the one before it.
-        a.announce(10).unwrap();
-        b.announce(100).unwrap();
+        second.reserve(40).unwrap();
+        assert!(b.reserve(51).unwrap_err().message().contains("of all callers (100 of 150"));
+        // The next message of a stream replaces the previous one.
+        a.reserve(10).unwrap();
+        b.reserve(100).unwrap();
         drop((a, second, b));
-        let flights = admission.lock();
-        assert!(flights.bytes == 0 && flights.held.is_empty());
+        let usage = in_flight.lock();
+        assert!(usage.bytes == 0 && usage.callers.is_empty());
     }
 }
