@@ -32,7 +32,7 @@ pub enum DiskError {
     #[error("another commander uses it; give each commander its own --data folder")]
     InUse,
     /// Another version of this program wrote it.
-    #[error("{}; use that version, or another --data folder", other_format(*.0))]
+    #[error("{}; use that version, or another --data folder", other_format(.0))]
     Format(u64),
     /// A record is damaged.
     #[error("the record of mission '{0}' is damaged: {1}")]
@@ -51,7 +51,7 @@ impl<E: Into<redb::Error>> From<E> for DiskError {
     }
 }
 
-fn other_format(format: u64) -> String {
+fn other_format(format: &u64) -> String {
     let own = env!("CARGO_PKG_VERSION");
     match format {
         1 => format!("written by magex 0.1.0 (commit 389f705), which reads it; this is magex {own}"),

@@ -88,7 +88,7 @@ where
                 match code {
                     // The common case formats nothing.
                     Code::Ok => calls.total.with_label_values(&[method, "Ok"]).inc(),
-                    code => calls.total.with_label_values(&[method, &format!("{code:?}")]).inc(),
+                    code => calls.total.with_label_values(&[method, format!("{code:?}").as_str()]).inc(),
                 }
                 calls.seconds.with_label_values(&[method]).observe(start.elapsed().as_secs_f64());
             }

@@ -78,7 +78,10 @@ where
             tokio::select! {
                 biased;
                 answer = answer => answer,
-                () = sleep => Ok(Status::deadline_exceeded(format!("grpc-timeout: not done within {timeout:?}")).into_http()),
+                () = sleep => {
+                    let problem = format!("grpc-timeout: not done within {timeout:?}");
+                    Ok(Status::deadline_exceeded(problem).into_http())
+                }
             }
         })
     }
