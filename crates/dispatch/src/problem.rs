@@ -80,7 +80,10 @@ impl Problem {
             Ok(v1::Mode::Sampled) => Mode::Sampled,
             Ok(v1::Mode::Greedy | v1::Mode::Unspecified) => Mode::Greedy,
             Err(_) => {
-                return Err(ConvertError::new("mode", format!("{} is not a mode; use sampled or greedy", message.mode)));
+                return Err(ConvertError::new(
+                    "mode",
+                    format!("{} is not a mode; use sampled or greedy", message.mode),
+                ));
             }
         };
         let positions = match (message.agents, message.goals) {
