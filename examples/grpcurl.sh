@@ -8,7 +8,7 @@ grpcurl -plaintext "$at" list
 grpcurl -plaintext "$at" grpc.health.v1.Health/Check
 grpcurl -plaintext "$at" describe magex.v1.AssignRequest
 
-grpcurl -plaintext -d '{"agents": {"dims": 2, "coordinates": [0, 0, 4, 0]}, "goals": {"dims": 2, "coordinates": [4, 1, 0, 1]}, "agent_ids": ["ada", "bob"], "goal_ids": ["south", "north"], "scheduler": "SCHEDULER_KIND_EXACT_TOTAL"}' "$at" magex.v1.CommanderService/Assign
+grpcurl -plaintext -d '{"agents": {"dims": 2, "coordinates": [0, 0, 4, 0]}, "goals": {"dims": 2, "coordinates": [4, 1, 0, 1]}, "agent_ids": ["ada", "bob"], "goal_ids": ["south", "north"], "scheduler": "ASSIGNMENT_METHOD_EXACT"}' "$at" magex.v1.CommanderService/Assign
 
 grpcurl -plaintext -d '{"mission_id": "yard", "agents": [{"id": "ada", "position": [0, 0]}, {"id": "bob", "position": [4, 0]}], "goals": [{"id": "north", "position": [0, 1]}, {"id": "south", "position": [8, 1]}], "switching_cost": 2}' "$at" magex.v1.CommanderService/CreateMission
 grpcurl -plaintext -d '{"mission_id": "yard", "agents": [{"id": "ada", "state": "MEMBER_STATE_FAILED"}]}' "$at" magex.v1.CommanderService/UpdateMission

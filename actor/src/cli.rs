@@ -6,11 +6,11 @@ use clap::Args;
 use magex_core::config::RunConfig;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
-use magex_runtime::http::{self, HttpArgs, Page};
+use magex_runtime::http;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::process;
 use magex_runtime::security::CallerArgs;
-use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
-use magex_runtime::{process, shutdown};
+use magex_runtime::service::{self, ServiceArgs};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -36,62 +36,30 @@ pub struct ActorArgs {
     /// Wait for another run when this one is complete
     #[arg(long, env = "MAGEX_ACTOR_STAY")]
     pub stay: bool,
-    /// Metrics and health over HTTP
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub http: HttpArgs,
-    /// Where traces go
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub traces: TraceArgs,
     /// Credentials for learner and commander.
     #[command(flatten)]
     #[serde(flatten)]
     pub security: CallerArgs,
-    /// Format of log lines
-    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
-    #[serde(skip)]
-    pub log_format: LogFormat,
-    /// Print the options in effect and exit
-    #[arg(long)]
-    #[serde(skip)]
-    pub print_config: bool,
-    /// Check that the actor with its page at --http is alive, and exit: 0 alive, 1 not
-    #[arg(long)]
-    #[serde(skip)]
-    pub health_check: bool,
+    /// Options of every service
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub service: ServiceArgs,
 }
 
 /// Runs an actor until shutdown or the end of the run. Returns the exit code.
 pub fn run(args: ActorArgs) -> Result<u8, Failure> {
-    if args.health_check {
-        return probe::own_page(args.http.http.as_deref());
+    if args.service.health_check {
+        return probe::own_page(args.service.http.http.as_deref());
     }
-    if args.print_config {
+    if args.service.print_config {
         process::print(&toml::to_string(&args).map_err(Failure::usage)?);
         return Ok(exit::OK);
     }
     let config = configure(&args)?;
-    process::refuse_huge_pages();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .thread_name("magex-net")
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
-    let telemetry = {
-        let _runtime = runtime.enter();
-        telemetry::init("magex-actor", args.log_format, &args.traces).map_err(Failure::usage)?
-    };
-    let end = runtime.block_on(async {
-        let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        let page = args.http.bind().await.map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-        process::announce_ready("actor", None, page.as_ref().map(Page::address));
+    let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
-        if let Some(page) = page {
-            page.serve(http::routes(metrics.clone()), stop.clone());
-        }
-        run_watched(config, PolicyWorker::maker(), &metrics, stop).await.map_err(|error| match &error {
+        context.announce(http::routes(metrics.clone()));
+        run_watched(config, PolicyWorker::maker(), &metrics, context.stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
             ActorError::Evicted { .. } => Failure::new(exit::INTERNAL, &error),
@@ -99,11 +67,7 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
                 Failure::new(exit::UNAVAILABLE, &error)
             }
         })
-    });
-    telemetry.flush();
-    // A rollout thread may still be busy with a cancelled shard.
-    runtime.shutdown_background();
-    let report = end?;
+    })?;
     let ActorReport { sessions, accepted, duplicate, rejected, failed } = report;
     tracing::info!(sessions, accepted, duplicate, rejected, failed, "stopped");
     Ok(exit::OK)

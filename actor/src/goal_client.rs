@@ -1,7 +1,7 @@
 //! The client of the commander service: the goals of a shard's episodes.
 
 use magex_proto::MAX_BATCH_BYTES;
-pub use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind, WeightsKey};
+pub use magex_proto::goals::{GoalReply, GoalRequest, WeightsKey};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::backoff::Backoff;

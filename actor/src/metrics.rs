@@ -3,27 +3,26 @@
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::task::TaskConfig;
 use magex_proto::v1::ShardTiming;
-use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Metrics, Seconds};
-use std::time::Duration;
+use magex_runtime::metrics::{Gauge, GaugeVec, Histogram, IntCounter, IntCounterVec, Metrics};
 
 /// The metrics of an actor.
 #[derive(Debug)]
 pub(crate) struct ActorMetrics {
-    shards: Counters,
-    joint_steps: Counters,
-    agent_steps: Counters,
-    rollout: Seconds,
-    goals_wait: Seconds,
-    weights_wait: Seconds,
-    pub(crate) upload: Seconds,
-    pub(crate) upload_bytes: Counter,
-    pub(crate) weights_bytes: Counter,
+    shards: IntCounterVec,
+    joint_steps: IntCounterVec,
+    agent_steps: IntCounterVec,
+    rollout: Histogram,
+    goals_wait: Histogram,
+    weights_wait: Histogram,
+    pub(crate) upload: Histogram,
+    pub(crate) upload_bytes: IntCounter,
+    pub(crate) weights_bytes: IntCounter,
     pub(crate) weights_version: Gauge,
     pub(crate) connected: Gauge,
-    pub(crate) reconnects: Counter,
+    pub(crate) reconnects: IntCounter,
     pub(crate) threads: Gauge,
     pub(crate) busy: Gauge,
-    queue: Gauges,
+    queue: GaugeVec,
 }
 
 /// Outcomes of shards; the label of a metric.
@@ -53,36 +52,35 @@ impl ActorMetrics {
             queue: m.gauges("magex_actor_queue_messages", "Messages that wait in the actor's queues.", &["queue"]),
         };
         // A scrape shows all of them from the start.
-        OUTCOMES.iter().for_each(|outcome| metrics.shards.with(&[outcome]).add(0));
+        OUTCOMES.iter().for_each(|outcome| metrics.shards.with_label_values(&[outcome]).inc_by(0));
         QUEUES.iter().for_each(|queue| metrics.queue(queue, 0));
         for kind in ["train", "eval"] {
-            metrics.joint_steps.with(&[kind]).add(0);
-            metrics.agent_steps.with(&[kind]).add(0);
+            metrics.joint_steps.with_label_values(&[kind]).inc_by(0);
+            metrics.agent_steps.with_label_values(&[kind]).inc_by(0);
         }
         metrics
     }
 
     /// Counts a shard with this outcome.
     pub(crate) fn outcome(&self, outcome: &str) {
-        self.shards.with(&[outcome]).add(1);
+        self.shards.with_label_values(&[outcome]).inc();
     }
 
     pub(crate) fn queue(&self, name: &str, messages: usize) {
-        self.queue.with(&[name]).set(messages as f64);
+        self.queue.with_label_values(&[name]).set(messages as f64);
     }
 
     /// A shard was rolled out.
     pub(crate) fn done(&self, shard: &Shard, task: Option<&TaskConfig>, timing: &ShardTiming) {
         self.outcome("done");
-        let time = |seconds: f64| Duration::try_from_secs_f64(seconds).unwrap_or_default();
-        self.rollout.observe(time(timing.rollout_seconds));
-        self.goals_wait.observe(time(timing.goals_wait_seconds));
-        self.weights_wait.observe(time(timing.weights_wait_seconds));
+        self.rollout.observe(timing.rollout_seconds.max(0.0));
+        self.goals_wait.observe(timing.goals_wait_seconds.max(0.0));
+        self.weights_wait.observe(timing.weights_wait_seconds.max(0.0));
         if let Some(task) = task {
             let kind = if shard.kind == ShardKind::Train { "train" } else { "eval" };
             let joint = u64::from(shard.episodes) * u64::from(task.horizon);
-            self.joint_steps.with(&[kind]).add(joint);
-            self.agent_steps.with(&[kind]).add(joint * task.agents as u64);
+            self.joint_steps.with_label_values(&[kind]).inc_by(joint);
+            self.agent_steps.with_label_values(&[kind]).inc_by(joint * task.agents as u64);
         }
     }
 }

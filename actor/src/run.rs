@@ -203,7 +203,7 @@ impl Actor {
         };
         self.report.sessions += 1;
         let metrics = self.context.metrics.clone();
-        metrics.reconnects.add(u64::from(self.report.sessions > 1));
+        metrics.reconnects.inc_by(u64::from(self.report.sessions > 1));
         let pool = self.pool_for(welcome).await?;
         metrics.connected.set(1.0);
         let session =

@@ -180,7 +180,7 @@ impl<'a> Session<'a> {
                     Ok(permit) => {
                         let message = self.urgent.pop_front().or_else(|| self.bulk.pop_front());
                         if let Some(Request::Part(v1::ResultPart { part: Some(part), .. })) = &message {
-                            self.metrics.upload_bytes.add(part.data.len() as u64);
+                            self.metrics.upload_bytes.inc_by(part.data.len() as u64);
                         }
                         permit.send(v1::RolloutRequest { message });
                     }
@@ -217,7 +217,7 @@ impl<'a> Session<'a> {
             }
             Response::Ack(ack) => {
                 if let Some(result) = self.unacknowledged.results.remove(&ack.lease_id) {
-                    self.metrics.upload.observe(result.ready.elapsed());
+                    self.metrics.upload.observe(result.ready.elapsed().as_secs_f64());
                 }
                 match ack.verdict() {
                     v1::Verdict::Accepted => {

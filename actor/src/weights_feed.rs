@@ -33,7 +33,7 @@ async fn watch(
     while let Some((weights, _)) = stream.next().await? {
         backoff.reset();
         tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
-        metrics.weights_bytes.add(weights.bytes.len() as u64);
+        metrics.weights_bytes.inc_by(weights.bytes.len() as u64);
         metrics.weights_version.set(f64::from(weights.version.0));
         cache.insert(weights);
     }

@@ -1,18 +1,18 @@
-//! The contract on top of the parts: who may, what is asked, who answers.
+//! The gRPC contract: checks the caller's role, reads the request, and passes it to the service that answers it.
 
-use crate::answering::{Answering, Clock};
-use crate::batch::{self, Batches};
-use crate::keeper::{self, Keeper};
-use crate::metadata;
-use crate::scheduler::{GoalRequest, SchedulerKind};
-use crate::store::Store;
+use crate::assign_service::AssignService;
+use crate::call_budget::CallBudget;
+use crate::error::to_status;
+use crate::mission_service::{self, MissionService};
+use crate::model_store::ModelStore;
+use crate::scheduler::{AssignmentMethod, GoalRequest};
+use crate::shard_assign::{self, ShardAssign};
 use crate::streams::{self, Interest};
 use magex_dispatch::{Limits, Problem};
-use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
-use magex_runtime::access::{Role, caller};
-use magex_runtime::admission::Admission;
+use magex_runtime::net::auth::{Role, caller};
+use magex_runtime::net::in_flight::InFlight;
 use magex_runtime::{status, trace};
 use std::sync::Arc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -20,31 +20,31 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::Instrument as _;
 
-/// Missions that a watcher may name.
+/// Maximum number of missions that a watcher may name.
 const WATCHED: usize = 1000;
 
-/// Who asks for assignments.
+/// The roles of external clients.
 const CLIENT: &[Role] = &[Role::Client];
 
-/// Methods that stay open.
+/// Streaming methods.
 pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments"];
 
-/// Implements the contract.
+/// Implements the service.
 #[derive(Debug)]
 pub(crate) struct CommanderApi {
-    pub(crate) store: Arc<Store>,
-    pub(crate) answering: Arc<Answering>,
-    pub(crate) batches: Batches,
-    pub(crate) keeper: Arc<Keeper>,
-    pub(crate) admission: Arc<Admission>,
+    pub(crate) store: Arc<ModelStore>,
+    pub(crate) answering: Arc<AssignService>,
+    pub(crate) shards: ShardAssign,
+    pub(crate) missions: Arc<MissionService>,
+    pub(crate) in_flight: Arc<InFlight>,
     pub(crate) limits: Limits,
     pub(crate) draining: CancellationToken,
 }
 
 type Answer<T> = Result<Response<T>, Status>;
 
-fn invalid(error: ConvertError) -> Status {
-    status::invalid_argument(error.field, error.problem)
+fn budget<T>(request: &Request<T>) -> CallBudget {
+    CallBudget::start(request.extensions().get())
 }
 
 #[tonic::async_trait]
@@ -54,28 +54,28 @@ impl CommanderService for CommanderApi {
 
     async fn assign(&self, request: Request<v1::AssignRequest>) -> Answer<v1::AssignResponse> {
         caller(&request, CLIENT)?;
-        let clock = Clock::start(metadata::deadline(request.metadata()));
-        let problem = Problem::read(request.into_inner(), self.answering.seed(), &self.limits).map_err(invalid)?;
-        self.answering.respond(problem, clock).await.map(Response::new)
+        let budget = budget(&request);
+        let problem = Problem::read(request.into_inner(), self.answering.seed(), &self.limits).map_err(to_status)?;
+        self.answering.respond(problem, budget).await.map(Response::new)
     }
 
     async fn assign_many(&self, request: Request<v1::AssignManyRequest>) -> Answer<v1::AssignManyResponse> {
         caller(&request, CLIENT)?;
-        let clock = Clock::start(metadata::deadline(request.metadata()));
+        let budget = budget(&request);
         let teams = request.into_inner().teams;
         if teams.is_empty() || teams.len() > self.limits.teams {
-            let problem = format!("{} teams; from 1 to {} are answered", teams.len(), self.limits.teams);
+            let problem = format!("{} teams; send 1 to {}", teams.len(), self.limits.teams);
             return Err(status::invalid_argument("teams", problem));
         }
         let mut problems = Vec::with_capacity(teams.len());
         for (k, team) in teams.into_iter().enumerate() {
             let problem = Problem::read(team, self.answering.seed(), &self.limits);
-            problems.push(problem.map_err(|error| invalid(error.within(&format!("teams[{k}]"))))?);
+            problems.push(problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))?);
         }
         let mut answers = Vec::with_capacity(problems.len());
         for problem in problems {
-            answers.push(self.answering.respond(problem, clock).await?);
-            // Many small teams on this thread: others get their turn in between.
+            answers.push(self.answering.respond(problem, budget).await?);
+            // Many small teams on this thread: let other calls run in between.
             tokio::task::yield_now().await;
         }
         Ok(Response::new(v1::AssignManyResponse { answers }))
@@ -87,9 +87,9 @@ impl CommanderService for CommanderApi {
     ) -> Answer<Self::AssignStreamStream> {
         caller(&request, CLIENT)?;
         let (answers, stream) = streams::channel();
-        let (answering, admission, draining) = (self.answering.clone(), self.admission.clone(), self.draining.clone());
+        let (answering, in_flight, draining) = (self.answering.clone(), self.in_flight.clone(), self.draining.clone());
         let teams = request.into_inner();
-        tokio::spawn(streams::assign(answering, admission, self.limits, teams, answers, draining));
+        tokio::spawn(streams::assign(answering, in_flight, self.limits, teams, answers, draining));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
@@ -97,36 +97,36 @@ impl CommanderService for CommanderApi {
         caller(&request, &[Role::Actor])?;
         let span = tracing::info_span!(target: trace::TARGET, parent: None, "assign batch");
         trace::continue_from(&span, trace::of(request.metadata()));
-        let clock = Clock::start(metadata::deadline(request.metadata()));
-        let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(invalid)?;
-        batch::check(&request, &key, &self.limits)?;
+        let budget = budget(&request);
+        let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(to_status)?;
+        shard_assign::check(&request, &key, &self.limits)?;
         let version = request.shard.version;
         let request = Arc::new(request);
-        let answer = self.batches.answer(request.clone(), &key, clock, &self.draining);
-        let reply = Arc::new(answer.instrument(span).await?);
-        self.answering.gauges.answered(request.scheduler, false, clock.elapsed());
+        let answer = self.shards.answer(request.clone(), &key, budget, &self.draining);
+        let (reply, method) = answer.instrument(span).await?;
+        self.answering.metrics.answered(method, false, budget.elapsed());
         let message = reply.to_message(&request, version);
-        self.keeper.record(request, reply, key);
+        self.missions.record(request, Arc::new(reply), key, method);
         Ok(Response::new(message))
     }
 
     async fn create_mission(&self, request: Request<v1::CreateMissionRequest>) -> Answer<v1::CreateMissionResponse> {
         let caller = caller(&request, CLIENT)?;
-        let clock = Clock::start(metadata::deadline(request.metadata()));
-        let assignment = Some(self.keeper.create(caller, request.into_inner(), clock).await?);
+        let budget = budget(&request);
+        let assignment = Some(self.missions.create(caller, request.into_inner(), budget).await?);
         Ok(Response::new(v1::CreateMissionResponse { assignment }))
     }
 
     async fn update_mission(&self, request: Request<v1::UpdateMissionRequest>) -> Answer<v1::UpdateMissionResponse> {
         let caller = caller(&request, CLIENT)?;
-        let clock = Clock::start(metadata::deadline(request.metadata()));
-        let assignment = Some(self.keeper.update(caller, request.into_inner(), clock).await?);
+        let budget = budget(&request);
+        let assignment = Some(self.missions.update(caller, request.into_inner(), budget).await?);
         Ok(Response::new(v1::UpdateMissionResponse { assignment }))
     }
 
     async fn get_assignment(&self, request: Request<v1::GetAssignmentRequest>) -> Answer<v1::GetAssignmentResponse> {
         let caller = caller(&request, CLIENT)?;
-        let assignment = Some(self.keeper.get(&caller, &request.into_inner().mission_id)?);
+        let assignment = Some(self.missions.get(&caller, &request.into_inner().mission_id)?);
         Ok(Response::new(v1::GetAssignmentResponse { assignment }))
     }
 
@@ -135,7 +135,7 @@ impl CommanderService for CommanderApi {
         request: Request<v1::ListAssignmentsRequest>,
     ) -> Answer<v1::ListAssignmentsResponse> {
         let caller = caller(&request, CLIENT)?;
-        self.keeper.list(&caller, &request.into_inner()).map(Response::new)
+        self.missions.list(&caller, &request.into_inner()).map(Response::new)
     }
 
     async fn watch_assignments(
@@ -145,34 +145,32 @@ impl CommanderService for CommanderApi {
         let caller = caller(&request, CLIENT)?;
         let request = request.into_inner();
         if request.mission_ids.len() > WATCHED {
-            let problem =
-                format!("{} names are more than {WATCHED}; leave them out to watch all", request.mission_ids.len());
+            let problem = format!(
+                "{} names exceed the limit of {WATCHED}; leave the list empty to watch all",
+                request.mission_ids.len()
+            );
             return Err(status::invalid_argument("mission_ids", problem));
         }
-        let source = keeper::source("source", request.source)?;
+        let source = mission_service::source("source", request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
         let (watcher, stream) = streams::channel();
-        tokio::spawn(streams::watch(self.keeper.clone(), interest, watcher, self.draining.clone()));
+        tokio::spawn(streams::watch(self.missions.clone(), interest, watcher, self.draining.clone()));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
     async fn delete_mission(&self, request: Request<v1::DeleteMissionRequest>) -> Answer<v1::DeleteMissionResponse> {
         let caller = caller(&request, CLIENT)?;
-        self.keeper.delete(caller, request.into_inner().mission_id).await?;
+        self.missions.delete(caller, request.into_inner().mission_id).await?;
         Ok(Response::new(v1::DeleteMissionResponse {}))
     }
 
     async fn get_model(&self, request: Request<v1::GetModelRequest>) -> Answer<v1::GetModelResponse> {
         caller(&request, &[Role::Client, Role::Actor])?;
         let latest = self.store.latest();
-        let mut kinds =
-            vec![SchedulerKind::Exact, SchedulerKind::Makespan, SchedulerKind::Greedy, SchedulerKind::Random];
-        // The model of a run with a classical scheduler answers that run's actors, and nobody else.
-        let ready = latest.as_ref().is_some_and(|(_, scheduler)| scheduler.teams());
-        if ready {
-            kinds.insert(0, SchedulerKind::Learned);
-        }
-        let schedulers = kinds.into_iter().map(|kind| v1::SchedulerKind::from(kind).into()).collect();
+        // Weights of a run without a learned scheduler answer only that run's actors.
+        let ready = latest.as_ref().is_some_and(|(_, scheduler)| scheduler.method() == AssignmentMethod::Learned);
+        let methods = AssignmentMethod::ALL.into_iter().filter(|&method| ready || method != AssignmentMethod::Learned);
+        let schedulers = methods.map(|method| v1::AssignmentMethod::from(method).into()).collect();
         let response = match latest {
             Some((key, _)) => v1::GetModelResponse {
                 ready,

@@ -1,18 +1,25 @@
-//! The goal commander as a service: for the actors of a run, and for anybody who has agents and goals.
-mod answering;
+//! The goal commander as a service: for the actors of a run, and for external clients with agents and goals.
+//!
+//! [`service`] builds and serves it; `api` implements the gRPC contract. A call of an external client goes to `assign_service`
+//! (single teams, streams) or `mission_service` (stored teams). A shard of an actor goes to `shard_assign`, which asks the
+//! scheduler of its run ([`scheduler`], [`run_scheduler`], [`shard_goals`]). `model_store` holds the weights of the learner
+//! (`subscription`) or of a file ([`weights_file`]).
+
 mod api;
-mod batch;
-mod classical;
+mod assign_service;
+mod call_budget;
+mod cancel;
 pub mod cli;
-mod gauges;
-mod keeper;
-pub mod learned;
-mod metadata;
+mod error;
+mod metrics;
+mod mission_service;
+mod model_store;
+pub mod run_scheduler;
 pub mod scheduler;
 pub mod service;
-mod store;
+mod shard_assign;
+pub mod shard_goals;
 mod streams;
 mod subscription;
-pub mod trained;
-mod training;
+mod training_view;
 pub mod weights_file;

@@ -1,4 +1,4 @@
-//! The commander as a process of its own.
+//! The commander as a process.
 
 use clap::Parser;
 use magex_commander::cli::{CommanderArgs, run};
@@ -6,7 +6,7 @@ use magex_runtime::exit::{self, Failure};
 use magex_runtime::process::ensure_environment;
 use std::process::ExitCode;
 
-/// Hands out goals: to the actors of a MAGE-X run, and to anybody who asks.
+/// Assigns goals, for the actors of a MAGE-X run and for external clients.
 #[derive(Debug, Parser)]
 #[command(name = "magex-commander", version)]
 struct Command {

@@ -1,10 +1,11 @@
-//! The seam to whatever has learned to hand out goals.
+//! The interface to the scheduler of a run.
 
 use magex_core::ids::Mode;
-pub use magex_proto::goals::{GoalReply, GoalRequest, SchedulerKind, WeightsKey};
+use magex_proto::convert::ConvertError;
+pub use magex_proto::goals::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use std::sync::Arc;
 
-/// One team from an outside client. N and G may differ.
+/// One team of an external client. N and G may differ.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TeamRequest {
     /// N: agents.
@@ -19,61 +20,56 @@ pub struct TeamRequest {
     pub goals: Vec<f32>,
     /// How the goals are chosen.
     pub mode: Mode,
-    /// Key of what is random.
+    /// Key of the random choices.
     pub seed: u64,
 }
 
 /// The assignment of one team.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TeamReply {
-    /// `[N]` the goal of each agent; no goal twice, and `None` only when goals run out.
+    /// `[N]` goal of each agent, all different; `None` only if there are fewer goals than agents.
     pub goals: Vec<Option<u32>>,
     /// `[N]` probability that the policy gave to each agent's goal, if it has one.
     pub probabilities: Option<Vec<f32>>,
 }
 
-/// Why there is no assignment.
+/// Why a scheduler has no assignment.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum AssignError {
-    /// This scheduler cannot answer such a request; another can.
+pub enum SchedulerError {
+    /// This scheduler does not support the request; another method does.
     #[error("not supported: {0}")]
     Unsupported(String),
-    /// The request makes no sense.
-    #[error("{field}: {problem}")]
-    Invalid {
-        /// Which field.
-        field: String,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// Nobody waits for it any more.
+    /// A field of the request is invalid.
+    #[error(transparent)]
+    Invalid(#[from] ConvertError),
+    /// The call has ended.
     #[error("interrupted")]
     Interrupted,
-    /// Anything else.
+    /// The weights or the configuration of the run are invalid.
     #[error("{0}")]
-    Failed(String),
+    Load(String),
+    /// The computation failed.
+    #[error("{0}")]
+    Compute(String),
 }
 
-impl AssignError {
-    /// The request makes no sense.
-    pub fn invalid(field: impl Into<String>, problem: impl Into<String>) -> Self {
-        Self::Invalid { field: field.into(), problem: problem.into() }
-    }
-}
-
-/// One version of a trained commander. Answers are pure functions of the request.
+/// The scheduler of a run with one version of its weights. Answers are pure functions of the request.
 pub trait Scheduler: Send + Sync {
-    /// Goals for the episodes of a shard, for as long as `go_on` says so; what is random is keyed by (seed, shard).
-    fn assign_batch(&self, request: &GoalRequest, go_on: &dyn Fn() -> bool) -> Result<GoalReply, AssignError>;
+    /// Goals for the episodes of a shard, for as long as `should_continue` holds; random choices are keyed by (seed, shard).
+    fn assign_batch(
+        &self,
+        request: &GoalRequest,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<GoalReply, SchedulerError>;
 
-    /// It answers single teams, too.
-    fn teams(&self) -> bool {
-        true
+    /// The method that the run configures. Only a learned scheduler answers single teams.
+    fn method(&self) -> AssignmentMethod {
+        AssignmentMethod::Learned
     }
 
-    /// Goals for one team; what is random is keyed by the seed.
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError>;
+    /// Goals for one team; random choices are keyed by the seed.
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError>;
 }
 
 /// Makes a scheduler of the weights (safetensors) and the run's configuration (TOML).
-pub type LoadScheduler = fn(&[u8], &str) -> Result<Arc<dyn Scheduler>, AssignError>;
+pub type LoadScheduler = fn(&[u8], &str) -> Result<Arc<dyn Scheduler>, SchedulerError>;

@@ -1,12 +1,12 @@
-//! How the commander is put together and served.
+//! Builds the commander and serves it.
 
-use crate::answering::Answering;
 use crate::api::{CommanderApi, STREAMS};
-use crate::batch::Batches;
-use crate::gauges::{self, CommanderGauges};
-use crate::keeper::Keeper;
+use crate::assign_service::AssignService;
+use crate::metrics::CommanderMetrics;
+use crate::mission_service::MissionService;
+use crate::model_store::ModelStore;
 use crate::scheduler::LoadScheduler;
-use crate::store::Store;
+use crate::shard_assign::ShardAssign;
 use crate::subscription;
 use crate::weights_file::{WeightsError, WeightsFile};
 use magex_dispatch::Limits;
@@ -14,13 +14,13 @@ use magex_dispatch::disk::{Disk, DiskError};
 use magex_dispatch::missions::{Bounds, Missions};
 use magex_proto::v1::commander_service_server::CommanderServiceServer;
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_BATCH_BYTES};
-use magex_runtime::admission::{Admission, FlightLimits, Kind};
-use magex_runtime::calls::Counted;
 use magex_runtime::client::{Settings, UrlError};
-use magex_runtime::deadline::Deadline;
-use magex_runtime::door::{Door, Open, Rules};
 use magex_runtime::health::Health;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::net::call_metrics::Counted;
+use magex_runtime::net::deadline::WithDeadline;
+use magex_runtime::net::guard::{Guard, Rules};
+use magex_runtime::net::in_flight::{CallKind, InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
 use magex_runtime::tls::TlsError;
@@ -30,28 +30,28 @@ use std::time::Duration;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-/// How often missions are looked through for those whose time is over.
+/// How often expired missions are deleted.
 const SWEEP: Duration = Duration::from_secs(2);
-/// Bytes of requests that are on their way or at work: of one caller, and of everybody.
+/// Bytes of requests in flight: of one caller, and of all callers.
 const CALLER_BYTES: usize = 64 << 20;
 const BYTES: usize = 256 << 20;
 /// Name of the file with the missions.
 const MISSIONS: &str = "missions.redb";
 
-/// What a commander is and may.
+/// Configuration of a commander.
 #[derive(Debug, Clone)]
-pub struct CommanderConfig {
-    /// The learner whose weights are followed, `http://host:port`.
+pub struct ServiceConfig {
+    /// Learner whose weights are used, `http://host:port`.
     pub learner_url: Option<String>,
-    /// What the learner is shown.
+    /// Credentials for the learner.
     pub client: Settings,
-    /// Weights that are there from the start, and followed.
+    /// Weights file, loaded at the start and whenever it is replaced.
     pub weights: Option<WeightsFile>,
-    /// Folder for the missions; without it they end with the process.
+    /// Folder of the missions; without it they are lost when the process ends.
     pub data: Option<PathBuf>,
-    /// How the port is guarded.
+    /// Security of the port.
     pub security: Security,
-    /// Sizes of requests.
+    /// Limits of a request.
     pub limits: Limits,
     /// Longest message, bytes.
     pub message_bytes: usize,
@@ -59,15 +59,15 @@ pub struct CommanderConfig {
     pub calls: usize,
     /// Open streams of one caller.
     pub streams: usize,
-    /// How many missions, how large and how old.
+    /// Limits of the missions.
     pub missions: Bounds,
-    /// How long a service that was told to stop goes on saying so before it closes its doors.
+    /// How long a stopping service rejects calls with UNAVAILABLE before it closes its port.
     pub drain: Duration,
-    /// What it counts.
+    /// Its metrics.
     pub metrics: Arc<Metrics>,
 }
 
-impl Default for CommanderConfig {
+impl Default for ServiceConfig {
     fn default() -> Self {
         Self {
             learner_url: None,
@@ -86,24 +86,24 @@ impl Default for CommanderConfig {
     }
 }
 
-impl CommanderConfig {
-    fn flights(&self) -> FlightLimits {
-        // One message of the longest kind has to fit.
+impl ServiceConfig {
+    fn in_flight(&self) -> InFlightLimits {
+        // A message of the maximum size must fit.
         let caller_bytes = CALLER_BYTES.max(self.message_bytes);
-        FlightLimits { calls: self.calls, streams: self.streams, caller_bytes, bytes: BYTES.max(self.message_bytes) }
+        InFlightLimits { calls: self.calls, streams: self.streams, caller_bytes, bytes: BYTES.max(self.message_bytes) }
     }
 }
 
 /// Why serving failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The learner's address is wrong.
+    /// The learner's address is malformed.
     #[error("learner: {0}")]
     Url(#[from] UrlError),
-    /// The weights that were given cannot be used.
+    /// The weights are unusable.
     #[error("weights: {0}")]
     Weights(#[from] WeightsError),
-    /// The missions cannot be read.
+    /// The missions cannot be loaded.
     #[error("missions in {}: {source}", path.display())]
     Missions {
         /// Their file or folder.
@@ -111,12 +111,12 @@ pub enum ServeError {
         /// Why.
         source: DiskError,
     },
-    /// The folder for the missions cannot be made.
+    /// The folder of the missions cannot be created.
     #[error("--data {}: {source}", path.display())]
     Data {
         /// The folder.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
     /// The certificates.
@@ -130,19 +130,19 @@ pub enum ServeError {
     Reflection(#[from] server::ReflectionError),
 }
 
-/// Serves until `shutdown`, then says so for `config.drain` and returns within [`server::GRACE`] more. Serving means: with
-/// a model, unless there is nowhere to get one from; then the classical schedulers are all there is.
+/// Serves until `shutdown`, then drains for `config.drain` and returns within [`server::GRACE`] more. The health is SERVING once
+/// a model is loaded, or at once if neither a learner nor weights are configured.
 pub async fn run(
-    config: CommanderConfig,
+    config: ServiceConfig,
     load_scheduler: LoadScheduler,
     incoming: Incoming,
     shutdown: CancellationToken,
 ) -> Result<(), ServeError> {
-    let store = Arc::new(Store::new());
-    let classical_only = config.learner_url.is_none() && config.weights.is_none();
+    let store = Arc::new(ModelStore::new());
+    let without_model = config.learner_url.is_none() && config.weights.is_none();
     let draining = CancellationToken::new();
-    let admission = Admission::new(config.flights(), draining.clone());
-    // Ends with this function, whichever way.
+    let in_flight = InFlight::new(config.in_flight(), draining.clone());
+    // Aborted when this function returns.
     let mut helpers = JoinSet::new();
     if let Some(file) = config.weights {
         let loaded = file.first(&store, load_scheduler).await?;
@@ -151,25 +151,24 @@ pub async fn run(
     if let Some(url) = &config.learner_url {
         helpers.spawn(subscription::follow(config.client.lazy_channel(url)?, store.clone(), load_scheduler));
     }
-    let gauges = Arc::new(CommanderGauges::new(&config.metrics));
-    let answering = Answering::new(store.clone(), gauges.clone());
-    let keeper = Keeper::new(open_missions(config.data, config.missions).await?, answering.clone());
-    let (sweeper, closer) = (keeper.clone(), keeper.clone());
+    let metrics = Arc::new(CommanderMetrics::new(&config.metrics));
+    let answering = AssignService::new(store.clone(), metrics.clone());
+    let missions = MissionService::new(open_missions(config.data, config.missions).await?, answering.clone());
+    let (sweeper, closer) = (missions.clone(), missions.clone());
     helpers.spawn(async move {
         loop {
             sweeper.sweep().await;
             tokio::time::sleep(SWEEP).await;
         }
     });
-    let (limits, store_of_api) = (config.limits, store.clone());
-    gauges::watch(&config.metrics, &gauges, &store, &keeper, &admission, &answering);
+    refresh_before_scrape(&config.metrics, &metrics, &store, &missions, &in_flight, &answering);
     let api = CommanderApi {
-        store: store_of_api,
-        batches: Batches::new(store.clone(), answering.clone()),
+        store: store.clone(),
+        shards: ShardAssign::new(store.clone(), answering.clone()),
         answering,
-        keeper,
-        admission: admission.clone(),
-        limits,
+        missions,
+        in_flight: in_flight.clone(),
+        limits: config.limits,
         draining: draining.clone(),
     };
     let (health, health_service) = Health::new::<CommanderServiceServer<CommanderApi>>().await;
@@ -178,41 +177,59 @@ pub async fn run(
         .max_encoding_message_size(config.message_bytes.max(MAX_BATCH_BYTES));
     let Security { tls, access } = config.security;
     let connections = incoming.connections();
-    let rules = Rules {
-        access,
-        admission: admission.clone(),
-        streams: STREAMS,
-        message_bytes: config.message_bytes,
-        connections: connections.clone(),
-    };
+    let rules = Rules { access, in_flight: in_flight.clone(), streams: STREAMS, message_bytes: config.message_bytes };
+    let guarded = Guard::guarded(WithDeadline::new(service), rules, connections.clone());
     let router = server::secure_builder(tls.as_ref())?
-        .add_service(Open::new(health_service, connections.clone()))
-        .add_service(Counted::new(Door::new(Deadline::new(service), rules), gauges.calls.clone()));
+        .add_service(Guard::public(health_service, connections.clone()))
+        .add_service(Counted::new(guarded, metrics.calls.clone()));
     let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
     let closed = CancellationToken::new();
-    let (told, closing, drain) = (shutdown, closed.clone(), config.drain);
+    let (stop, closing, drain) = (shutdown, closed.clone(), config.drain);
     helpers.spawn(async move {
-        if classical_only || told.run_until_cancelled(store.ready()).await.is_some() {
+        if without_model || stop.run_until_cancelled(store.ready()).await.is_some() {
             health.set(true).await;
-            told.cancelled().await;
+            stop.cancelled().await;
         }
-        // First the truth, then no more work, then the doors: who asks in between is told to go elsewhere.
+        // Shutdown order: report NOT_SERVING, reject new calls with UNAVAILABLE for `drain`, then close the listener.
         health.set(false).await;
         draining.cancel();
         tokio::time::sleep(drain).await;
-        tracing::debug!(calls = admission.count(Kind::Call), "closing the doors");
+        tracing::debug!(calls = in_flight.count(CallKind::Call), "closing the listener");
         closing.cancel();
     });
     let served = server::serve(router, incoming, closed, server::GRACE).await;
     helpers.abort_all();
-    // Connections that were left may hold on to the rest for a while.
+    // Dropped connections may keep the service alive for a while, but another commander may need the file.
     let _ = tokio::task::spawn_blocking(move || closer.close()).await;
     Ok(served?)
 }
 
+/// Sets the gauges that are computed on demand before every scrape, for as long as the service exists.
+fn refresh_before_scrape(
+    registry: &Metrics,
+    metrics: &Arc<CommanderMetrics>,
+    store: &Arc<ModelStore>,
+    missions: &Arc<MissionService>,
+    in_flight: &Arc<InFlight>,
+    answering: &Arc<AssignService>,
+) {
+    let metrics = metrics.clone();
+    let weak = (Arc::downgrade(store), Arc::downgrade(missions), Arc::downgrade(in_flight), Arc::downgrade(answering));
+    registry.before_scrape(move || {
+        let alive = (weak.0.upgrade(), weak.1.upgrade(), weak.2.upgrade(), weak.3.upgrade());
+        let (Some(store), Some(missions), Some(in_flight), Some(answering)) = alive else { return };
+        metrics.in_flight.set(in_flight.count(CallKind::Call) as f64);
+        metrics.streams.set(in_flight.count(CallKind::Stream) as f64);
+        metrics.missions.set(missions.count() as f64);
+        metrics.backlog.set(missions.backlog() as f64);
+        metrics.weights_version.set(store.latest().map_or(-1.0, |(key, _)| f64::from(key.version.0)));
+        metrics.free_processors.set(answering.free_processors() as f64);
+    });
+}
+
 async fn open_missions(data: Option<PathBuf>, bounds: Bounds) -> Result<Missions, ServeError> {
     let Some(folder) = data else {
-        tracing::debug!("no --data folder: missions end with this process");
+        tracing::debug!("no --data folder: missions are lost when the process ends");
         return Missions::open(None, bounds).map_err(|source| ServeError::Missions { path: PathBuf::new(), source });
     };
     std::fs::create_dir_all(&folder).map_err(|source| ServeError::Data { path: folder.clone(), source })?;

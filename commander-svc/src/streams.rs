@@ -1,12 +1,14 @@
-//! The streaming calls: teams one after the other, and watching missions.
+//! The streaming calls: streams of teams, and watching missions.
 
-use crate::answering::{Answering, Clock};
-use crate::keeper::{Event, Keeper, now_ms, visible};
+use crate::assign_service::AssignService;
+use crate::call_budget::CallBudget;
+use crate::error::to_status;
+use crate::mission_service::{Event, MissionService, now_ms, visible};
 use magex_dispatch::missions::passes;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
-use magex_runtime::access::Caller;
-use magex_runtime::admission::{Admission, stopping};
+use magex_runtime::net::auth::Caller;
+use magex_runtime::net::in_flight::{InFlight, stopping};
 use magex_runtime::status;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -17,17 +19,17 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 use tonic_types::StatusExt as _;
 
-/// Answers that wait for a client to read them. More would only be older.
+/// Capacity of the queue of answers to a client.
 const AHEAD: usize = 2;
-/// A client that reads nothing for so long is left.
-const MUTE: Duration = Duration::from_secs(60);
-/// Assignments of a snapshot that are fetched at once.
+/// A client that does not read for this time loses its stream.
+const READ_TIMEOUT: Duration = Duration::from_secs(60);
+/// Assignments of a snapshot that are fetched together.
 const PAGE: usize = 64;
 
 /// Answers a stream of teams in order, until the client ends it or the service drains.
 pub(crate) async fn assign(
-    answering: Arc<Answering>,
-    admission: Arc<Admission>,
+    answering: Arc<AssignService>,
+    in_flight: Arc<InFlight>,
     limits: Limits,
     mut teams: Streaming<v1::AssignStreamRequest>,
     answers: mpsc::Sender<Result<v1::AssignStreamResponse, Status>>,
@@ -41,12 +43,12 @@ pub(crate) async fn assign(
         };
         let answer = match next {
             Ok(Some(request)) => {
-                let clock = Clock::start(None);
+                let budget = CallBudget::start(None);
                 let sequence = request.sequence;
-                let result = match admission.check_open() {
-                    // Whoever hangs up does not keep a processor busy.
+                let result = match in_flight.check_open() {
+                    // A client that cancels frees the processor.
                     Ok(()) => tokio::select! {
-                        result = one(&answering, &limits, request.team, clock) => result,
+                        result = one(&answering, &limits, request.team, budget) => result,
                         () = answers.closed() => return,
                     },
                     Err(status) => Err(status),
@@ -61,24 +63,21 @@ pub(crate) async fn assign(
             Err(status) => Err(status),
         };
         let end = answer.is_err();
-        if answers.send_timeout(answer, MUTE).await.is_err() || end {
+        if answers.send_timeout(answer, READ_TIMEOUT).await.is_err() || end {
             break;
         }
     }
 }
 
 async fn one(
-    answering: &Arc<Answering>,
+    answering: &Arc<AssignService>,
     limits: &Limits,
     team: Option<v1::AssignRequest>,
-    clock: Clock,
+    budget: CallBudget,
 ) -> Result<v1::AssignResponse, Status> {
     let team = team.ok_or_else(|| status::invalid_argument("team", "missing"))?;
-    let problem = Problem::read(team, answering.seed(), limits).map_err(|error| {
-        let error = error.within("team");
-        status::invalid_argument(error.field, error.problem)
-    })?;
-    answering.respond(problem, clock).await
+    let problem = Problem::read(team, answering.seed(), limits).map_err(|error| to_status(error.within("team")))?;
+    answering.respond(problem, budget).await
 }
 
 fn problem(status: &Status) -> v1::AssignProblem {
@@ -93,7 +92,7 @@ fn problem(status: &Status) -> v1::AssignProblem {
     }
 }
 
-/// What a watcher wants to know.
+/// The filter of a watcher.
 #[derive(Debug, Clone)]
 pub(crate) struct Interest {
     pub(crate) caller: Caller,
@@ -109,28 +108,33 @@ impl Interest {
 
 type Watcher = mpsc::Sender<Result<v1::WatchAssignmentsResponse, Status>>;
 
-/// Tells a watcher what is, and then what changes, until it goes or the service drains.
-pub(crate) async fn watch(keeper: Arc<Keeper>, interest: Interest, watcher: Watcher, draining: CancellationToken) {
-    // Subscribed first: what happens during the snapshot is not missed.
-    let mut events = keeper.events();
-    let Some(mut told) = snapshot(&keeper, &interest, &watcher).await else { return };
+/// Sends a watcher a snapshot, then every change, until it cancels or the service drains.
+pub(crate) async fn watch(
+    missions: Arc<MissionService>,
+    interest: Interest,
+    watcher: Watcher,
+    draining: CancellationToken,
+) {
+    // Subscribes first, so that no change during the snapshot is missed.
+    let mut events = missions.events();
+    let Some(mut sent) = snapshot(&missions, &interest, &watcher).await else { return };
     loop {
         let event = tokio::select! {
             event = events.recv() => event,
             () = watcher.closed() => break,
             () = draining.cancelled() => {
-                // It may be gone, too.
-                let _ = watcher.send_timeout(Err(stopping()), MUTE).await;
+                // The watcher may have cancelled, too.
+                let _ = watcher.send_timeout(Err(stopping()), READ_TIMEOUT).await;
                 break;
             }
         };
         let alive = match event {
-            Ok(event) => tell(&interest, &watcher, &mut told, event).await,
+            Ok(event) => publish(&interest, &watcher, &mut sent, event).await,
             Err(RecvError::Lagged(missed)) => {
-                tracing::debug!(missed, watcher = &*interest.caller.name, "a slow watcher gets everything anew");
-                match snapshot(&keeper, &interest, &watcher).await {
+                tracing::debug!(missed, watcher = &*interest.caller.name, "a slow watcher gets a new snapshot");
+                match snapshot(&missions, &interest, &watcher).await {
                     Some(now) => {
-                        told = now;
+                        sent = now;
                         true
                     }
                     None => false,
@@ -144,39 +148,43 @@ pub(crate) async fn watch(keeper: Arc<Keeper>, interest: Interest, watcher: Watc
     }
 }
 
-/// Sends everything as it is. The revisions that were sent, or `None` if the watcher has gone.
-async fn snapshot(keeper: &Keeper, interest: &Interest, watcher: &Watcher) -> Option<HashMap<String, (i64, u64)>> {
-    let (mut told, mut after) = (HashMap::new(), String::new());
+/// Sends the current assignments. Returns the revisions sent, or `None` if the watcher has cancelled.
+async fn snapshot(
+    missions: &MissionService,
+    interest: &Interest,
+    watcher: &Watcher,
+) -> Option<HashMap<String, (i64, u64)>> {
+    let (mut sent, mut after) = (HashMap::new(), String::new());
     loop {
-        let (page, _) = keeper.after(&interest.caller, &after, PAGE, interest.source);
+        let (page, _) = missions.after(&interest.caller, &after, PAGE, interest.source);
         let Some(last) = page.last() else { break };
         after.clone_from(&last.mission_id);
         for assignment in page.into_iter().filter(|a| interest.wants(&a.mission_id)) {
-            told.insert(assignment.mission_id.clone(), (assignment.created_ms, assignment.revision));
+            sent.insert(assignment.mission_id.clone(), (assignment.created_ms, assignment.revision));
             send(watcher, v1::WatchKind::Snapshot, Some(assignment)).await?;
         }
     }
     send(watcher, v1::WatchKind::Synced, None).await?;
-    Some(told)
+    Some(sent)
 }
 
-async fn tell(interest: &Interest, watcher: &Watcher, told: &mut HashMap<String, (i64, u64)>, event: Event) -> bool {
+async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut HashMap<String, (i64, u64)>, event: Event) -> bool {
     match event {
         Event::Mission(kind, mission) => {
             let a = &mission.assignment;
-            // The last word about a mission that is over is still about its owner's mission.
+            // The last event of a deleted or expired mission is still visible to its owner.
             let now = if kind == v1::WatchKind::Changed { now_ms() } else { i64::MIN };
             let wanted = passes(interest.source, v1::MissionSource::Client) && interest.wants(&a.mission_id);
             if !wanted || !visible(&interest.caller, &mission, now) {
                 return true;
             }
             match kind {
-                // The snapshot was newer.
-                v1::WatchKind::Changed if told.get(&a.mission_id).is_some_and(|&t| t >= (a.created_ms, a.revision)) => {
+                // Older than the snapshot.
+                v1::WatchKind::Changed if sent.get(&a.mission_id).is_some_and(|&t| t >= (a.created_ms, a.revision)) => {
                     return true;
                 }
-                v1::WatchKind::Changed => drop(told.insert(a.mission_id.clone(), (a.created_ms, a.revision))),
-                _ => drop(told.remove(&a.mission_id)),
+                v1::WatchKind::Changed => drop(sent.insert(a.mission_id.clone(), (a.created_ms, a.revision))),
+                _ => drop(sent.remove(&a.mission_id)),
             }
             send(watcher, kind, Some(a.clone())).await.is_some()
         }
@@ -196,10 +204,10 @@ async fn tell(interest: &Interest, watcher: &Watcher, told: &mut HashMap<String,
 
 async fn send(watcher: &Watcher, kind: v1::WatchKind, assignment: Option<v1::Assignment>) -> Option<()> {
     let message = v1::WatchAssignmentsResponse { kind: kind.into(), assignment };
-    watcher.send_timeout(Ok(message), MUTE).await.ok()
+    watcher.send_timeout(Ok(message), READ_TIMEOUT).await.ok()
 }
 
-/// A channel of answers as long as a slow client may be behind.
+/// A channel of answers to a client.
 pub(crate) fn channel<T>() -> (mpsc::Sender<T>, mpsc::Receiver<T>) {
     mpsc::channel(AHEAD)
 }

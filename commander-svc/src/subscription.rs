@@ -1,7 +1,7 @@
 //! Keeps the store filled with what the learner publishes.
 
+use crate::model_store::{Model, ModelStore};
 use crate::scheduler::{LoadScheduler, WeightsKey};
-use crate::store::{Model, Store};
 use magex_proto::v1::SubscriberRole;
 use magex_proto::weights::Weights;
 use magex_proto::weights_watch::{OPEN_TIMEOUT, WeightsStream, late};
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use tonic::Status;
 
 /// Follows the learner's weights and reconnects after every failure. Never returns.
-pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: LoadScheduler) {
+pub(crate) async fn follow(channel: Channel, store: Arc<ModelStore>, load_scheduler: LoadScheduler) {
     let mut backoff = Backoff::default();
     let mut waiting = false;
     loop {
@@ -29,7 +29,7 @@ pub(crate) async fn follow(channel: Channel, store: Arc<Store>, load_scheduler: 
 
 async fn watch(
     channel: Channel,
-    store: &Store,
+    store: &ModelStore,
     load_scheduler: LoadScheduler,
     backoff: &mut Backoff,
     waiting: &mut bool,
@@ -47,7 +47,7 @@ async fn watch(
 }
 
 /// Makes a model of weights and puts it into the store, usable or not.
-pub(crate) async fn load(weights: Weights, toml: String, store: &Store, load_scheduler: LoadScheduler) {
+pub(crate) async fn load(weights: Weights, toml: String, store: &ModelStore, load_scheduler: LoadScheduler) {
     let Weights { run_id, version, sha256, bytes } = weights;
     let key = WeightsKey { run_id, version, sha256 };
     let loading = tokio::task::spawn_blocking(move || load_scheduler(&bytes, &toml));

@@ -1,21 +1,21 @@
-//! Weights from a run folder or a file, and again whenever the file is replaced.
+//! Weights from a run folder or a file, reloaded whenever the file is replaced.
 
+use crate::model_store::{Model, ModelStore};
 use crate::scheduler::{LoadScheduler, WeightsKey};
-use crate::store::{Model, Store};
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::weights::sha256_hex;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-/// How often the file is looked at.
+/// Polling interval of the files.
 const INTERVAL: Duration = Duration::from_secs(1);
 
-/// Names in a run folder.
+/// File names in a run folder.
 const WEIGHTS: &str = "weights.safetensors";
 const CONFIG: &str = "config.toml";
 
-/// Where weights are and the configuration of the run that made them.
+/// The weights of a run and its configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WeightsFile {
     weights: PathBuf,
@@ -23,7 +23,7 @@ pub struct WeightsFile {
     name: String,
 }
 
-/// Weights that cannot be used.
+/// Weights that are unusable.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{path}: {problem}")]
 pub struct WeightsError {
@@ -37,7 +37,7 @@ impl WeightsError {
     }
 }
 
-/// What both files look like from outside; when it differs they are read.
+/// Modification time and size of both files; when it differs they are read.
 type Stamp = [(SystemTime, u64); 2];
 
 /// SHA-256 of the weights and of the configuration.
@@ -47,7 +47,7 @@ impl WeightsFile {
     /// A run folder, or a weights file with the configuration given or beside it.
     ///
     /// # Errors
-    /// Nothing is there, or it is not complete.
+    /// A file is missing.
     pub fn find(path: &Path, config: Option<&Path>) -> Result<Self, WeightsError> {
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         let (weights, beside) = if path.is_dir() {
@@ -59,19 +59,16 @@ impl WeightsFile {
         if !weights.is_file() {
             return Err(WeightsError::new(
                 &weights,
-                "there is no such file; give a finished run's folder or its weights",
+                "no such file; give the folder of a finished run, or its weights file",
             ));
         }
         if !config.is_file() {
-            return Err(WeightsError::new(
-                &config,
-                "there is no such file; give the run's configuration with --config",
-            ));
+            return Err(WeightsError::new(&config, "no such file; give the run's configuration with --config"));
         }
         Ok(Self { weights, config, name })
     }
 
-    /// Reads both files and makes a model of them. With what it was made of, to tell whether it is another.
+    /// Reads both files and loads the model. Returns their hashes, too, to detect a change of content.
     fn load(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), WeightsError> {
         let bytes = std::fs::read(&self.weights).map_err(|error| WeightsError::new(&self.weights, error))?;
         let toml = std::fs::read_to_string(&self.config).map_err(|error| WeightsError::new(&self.config, error))?;
@@ -82,17 +79,21 @@ impl WeightsFile {
         Ok((Model { key, scheduler: Ok(scheduler) }, content))
     }
 
-    /// `None` while one of them is not there.
+    /// `None` while a file is missing.
     fn stamp(&self) -> Option<Stamp> {
-        let look = |path: &Path| {
+        let stamp = |path: &Path| {
             let meta = std::fs::metadata(path).ok()?;
             Some((meta.modified().ok()?, meta.len()))
         };
-        Some([look(&self.weights)?, look(&self.config)?])
+        Some([stamp(&self.weights)?, stamp(&self.config)?])
     }
 
-    /// Loads them once, into the store.
-    pub(crate) async fn first(&self, store: &Store, load_scheduler: LoadScheduler) -> Result<Loaded, WeightsError> {
+    /// Loads the model for the first time.
+    pub(crate) async fn first(
+        &self,
+        store: &ModelStore,
+        load_scheduler: LoadScheduler,
+    ) -> Result<Loaded, WeightsError> {
         let (own, stamp) = (self.clone(), self.stamp());
         let load = tokio::task::spawn_blocking(move || own.load(0, load_scheduler));
         let (model, content) = load.await.map_err(|error| WeightsError::new(&self.weights, error))??;
@@ -102,10 +103,10 @@ impl WeightsFile {
         Ok(Loaded { stamp, content })
     }
 
-    /// Loads them again, as the next version, whenever one is replaced. What cannot be used changes nothing, and is tried
-    /// again: the other file, or the rest of this one, may be on its way.
-    pub(crate) async fn follow(self, mut loaded: Loaded, store: Arc<Store>, load_scheduler: LoadScheduler) {
-        let (mut version, mut told) = (0, None);
+    /// Loads the next version whenever a file is replaced. Unusable files change nothing and are retried, because the other
+    /// file, or the rest of this one, may still be written.
+    pub(crate) async fn follow(self, mut loaded: Loaded, store: Arc<ModelStore>, load_scheduler: LoadScheduler) {
+        let (mut version, mut warned) = (0, None);
         loop {
             tokio::time::sleep(INTERVAL).await;
             let stamp = self.stamp();
@@ -122,10 +123,10 @@ impl WeightsFile {
                     loaded = Loaded { stamp, content };
                     store.insert(model);
                 }
-                // Once for each state of the files.
-                Err(error) if told != stamp => {
-                    told = stamp;
-                    tracing::warn!(%error, "new weights cannot be used; the old ones go on answering");
+                // Warns once per state of the files.
+                Err(error) if warned != stamp => {
+                    warned = stamp;
+                    tracing::warn!(%error, "the new weights are unusable; the previous ones stay in use");
                 }
                 Err(_) => {}
             }
@@ -133,10 +134,10 @@ impl WeightsFile {
     }
 }
 
-/// What was loaded last.
+/// The files that were loaded last.
 #[derive(Debug)]
 pub(crate) struct Loaded {
-    /// What the files looked like before they were read.
+    /// Their stamp before they were read.
     stamp: Option<Stamp>,
     content: Content,
 }

@@ -59,7 +59,7 @@ def main():
         goals=positions([(8, 1), (0, 1)]),
         agent_ids=["ada", "bob", "cy"],
         goal_ids=["south", "north"],
-        scheduler=types.SCHEDULER_KIND_EXACT_TOTAL,
+        scheduler=types.ASSIGNMENT_METHOD_EXACT,
     )
     answer = stub.Assign(team, metadata=metadata, timeout=5)
     for pair in answer.pairs:

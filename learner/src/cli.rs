@@ -15,10 +15,9 @@ use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
-use magex_runtime::http::{HttpArgs, Page};
-use magex_runtime::security::ServerArgs;
-use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
-use magex_runtime::{process, server, shutdown};
+use magex_runtime::security::{Security, ServerArgs};
+use magex_runtime::service::{self, Context, ServiceArgs};
+use magex_runtime::{process, server};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -65,32 +64,20 @@ pub struct LearnerArgs {
     /// Training threads [default: one per processor]
     #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
     pub threads: usize,
-    /// Live page, metrics and health over HTTP
+    /// Options of every service
     #[command(flatten)]
-    pub http: HttpArgs,
-    /// Export of traces
-    #[command(flatten)]
-    pub traces: TraceArgs,
-    /// Format of log lines
-    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
-    pub log_format: LogFormat,
-    /// Print the run's configuration in effect and exit
-    #[arg(long)]
-    pub print_config: bool,
-    /// Check that the learner on --listen serves, and exit: 0 it serves, 1 it does not
-    #[arg(long)]
-    pub health_check: bool,
+    pub service: ServiceArgs,
 }
 
 /// Trains until the run is complete or stopped. Returns the exit code.
 pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
-    if args.health_check {
+    if args.service.health_check {
         return probe::own(&args.listen, args.security.tls_cert.is_some());
     }
     args.resume |= args.resume_or_create && RunFolderState::of(&args.out) == RunFolderState::Run;
     let config = configure(&args)?;
     let toml = config.to_toml().map_err(Failure::usage)?;
-    if args.print_config {
+    if args.service.print_config {
         process::print(&toml);
         return Ok(exit::OK);
     }
@@ -99,24 +86,31 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     let security = args.security.read(&args.listen)?;
-    process::allow_open_files();
-    process::refuse_huge_pages();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .thread_name("magex-net")
-        .enable_all()
-        .build()
-        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
-    let telemetry = {
-        let _runtime = runtime.enter();
-        telemetry::init("magex-learner", args.log_format, &args.traces).map_err(Failure::usage)?
+    let end = service::main("learner", 2, &args.service, async |context| {
+        train(context, &args, config, toml, lease, security).await
+    });
+    let reason = match end? {
+        Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
+        Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
+        None => "the iteration did not end in time; the last checkpoint remains valid".to_owned(),
     };
+    tracing::info!(reason, out = %args.out.display(), "stopped; continue with --resume");
+    Ok(exit::TEMPORARY)
+}
+
+/// Binds the port, prepares the run folder, then trains and serves; `None` if the trainer did not end in time.
+async fn train(
+    mut context: Context,
+    args: &LearnerArgs,
+    config: RunConfig,
+    toml: String,
+    lease: Duration,
+    security: Security,
+) -> Result<Option<TrainOutcome>, Failure> {
     // Bound first: a port that is not available must not leave a run folder behind.
-    let (incoming, address) =
-        runtime.block_on(server::bind(&args.listen)).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-    let incoming = incoming.within(args.security.connections());
-    let page = runtime.block_on(args.http.bind()).map_err(|error| Failure::new(exit::UNAVAILABLE, error))?;
-    let mut trainer = prepare(&args, &config, &toml)?;
+    let (incoming, address) = context.listen(&args.listen, args.security.connections()).await?;
+    let stop = context.stop.clone();
+    let mut trainer = prepare(args, &config, &toml)?;
     let identity = RunIdentity {
         run_id: trainer.run_id().clone(),
         name: args.out.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
@@ -130,64 +124,54 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
     let (handle, mut collector) = learner_service(identity, limits);
     trainer.observe(handle.observer());
     let handle = handle.guarded(security);
-    let end = runtime.block_on(async {
-        let stop = shutdown::on_signal().map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        process::announce_ready("learner", Some(address), page.as_ref().map(Page::address));
-        let showing = page.map(|page| {
-            let live = Arc::new(LivePage::new(&config, live));
+    let showing = context.has_page().then(|| Arc::new(LivePage::new(&config, live)));
+    let routes = match &showing {
+        Some(live) => {
             trainer.observe(live.clone());
             let status = handle.clone();
-            let routes = handle.routes().merge(live.routes(move || Some(status.status())));
-            (live, page.serve(routes, stop.clone()))
-        });
-        let serving = tokio::spawn(serve(handle.clone(), incoming, stop.clone()));
-        let (ended, training_end) = tokio::sync::oneshot::channel();
-        std::thread::Builder::new()
-            .name("magex-train".to_owned())
-            .stack_size(TRAINER_STACK)
-            .spawn(move || {
-                // The receiver is gone when the process shuts down.
-                let _ = ended.send(trainer.run(&mut collector));
-            })
-            .map_err(|error| Failure::new(exit::INTERNAL, error))?;
-        let outcome = tokio::select! {
-            outcome = training_end => Some(outcome),
-            () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
-        };
-        if args.stay && matches!(outcome, Some(Ok(Ok(TrainOutcome::Finished(_))))) {
-            tracing::info!("the run is complete; serving its weights until shutdown");
-            tokio::select! {
-                () = stop.cancelled() => {}
-                () = handle.stop_signal() => {}
-            }
-        } else if let Some((live, _)) = showing.as_ref().filter(|_| !stop.is_cancelled()) {
-            live.farewell().await;
+            handle.routes().merge(live.routes(move || Some(status.status())))
         }
-        // Notifies the actors, ends the streams and closes the port.
-        stop.cancel();
-        serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
-        if let Some((_, showing)) = showing {
-            // Ends no later than the server, which has the same grace period.
-            let _ = showing.await;
-        }
-        log_ledger(&handle.status());
-        match outcome {
-            Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
-            Some(Err(_)) => {
-                Err(Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above"))
-            }
-            None => Ok(None),
-        }
-    });
-    telemetry.flush();
-    runtime.shutdown_background();
-    let reason = match end? {
-        Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
-        Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
-        None => "the iteration did not end in time; the last checkpoint remains valid".to_owned(),
+        None => handle.routes(),
     };
-    tracing::info!(reason, out = %args.out.display(), "stopped; continue with --resume");
-    Ok(exit::TEMPORARY)
+    let page = context.announce(routes);
+    let serving = tokio::spawn(serve(handle.clone(), incoming, stop.clone()));
+    let (ended, training_end) = tokio::sync::oneshot::channel();
+    std::thread::Builder::new()
+        .name("magex-train".to_owned())
+        .stack_size(TRAINER_STACK)
+        .spawn(move || {
+            // The receiver is gone when the process shuts down.
+            let _ = ended.send(trainer.run(&mut collector));
+        })
+        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    let outcome = tokio::select! {
+        outcome = training_end => Some(outcome),
+        () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
+    };
+    if args.stay && matches!(outcome, Some(Ok(Ok(TrainOutcome::Finished(_))))) {
+        tracing::info!("the run is complete; serving its weights until shutdown");
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = handle.stop_signal() => {}
+        }
+    } else if let Some(live) = showing.filter(|_| !stop.is_cancelled()) {
+        live.farewell().await;
+    }
+    // Notifies the actors, ends the streams and closes the port.
+    stop.cancel();
+    serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
+    if let Some(page) = page {
+        // Ends no later than the server, which has the same grace period.
+        let _ = page.await;
+    }
+    log_ledger(&handle.status());
+    match outcome {
+        Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
+        Some(Err(_)) => {
+            Err(Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above"))
+        }
+        None => Ok(None),
+    }
 }
 
 /// Logs how all leases ended.

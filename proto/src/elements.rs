@@ -1,23 +1,23 @@
-//! How many elements a request has, counted before it is decoded.
+//! Limits the number of elements of a request before it is decoded.
 //!
-//! On the wire an empty element of a repeated field takes two bytes, decoded it takes up to some hundred: without a bound, a
-//! message of a few mebibytes would fill gigabytes before it could be checked.
+//! An empty element of a repeated field takes two bytes on the wire and up to several hundred decoded: without a limit, a message
+//! of a few mebibytes would decode to gigabytes before it could be checked.
 
 use crate::v1;
 use prost::encoding::{WireType, decode_varint};
 use std::any::TypeId;
 
-/// Elements that any request may have. Each [`BYTES_PER_ELEMENT`] of the request allow one more.
+/// Elements that any request may have; every [`BYTES_PER_ELEMENT`] bytes of the request allow one more.
 pub const ELEMENTS: usize = 131_072;
 
-/// A request whose elements take this many bytes on the wire each, on average, may have as many as fit.
+/// Bytes of a request per additional element.
 pub const BYTES_PER_ELEMENT: usize = 16;
 
-/// Elements that a team in a request for several counts as.
+/// Elements that a team counts as, in a request for several.
 const TEAM: usize = 64;
 
-/// Refuses the bytes of a request of type `T` with more elements than it may have: the limit. What cannot be read is left to
-/// the decoder, which stops at the same place.
+/// Rejects the bytes of a request of type `T` with too many elements, with the limit. Malformed bytes are left to the decoder, which
+/// stops at the same place.
 pub(crate) fn check<T: 'static>(bytes: &[u8]) -> Result<(), usize> {
     let limit = ELEMENTS + bytes.len() / BYTES_PER_ELEMENT;
     let teams = [TypeId::of::<v1::AssignManyRequest>(), TypeId::of::<v1::AssignStreamRequest>()];
@@ -38,8 +38,8 @@ fn within(count: &mut usize, limit: usize) -> bool {
     *count <= limit
 }
 
-/// Shows every length-delimited field to `seen`, for as long as that wants to go on; whether it still does at the end. Fields
-/// within a group, which nothing of ours has, are seen as if they stood outside: it is never fewer than there are.
+/// Calls `seen` with every length-delimited field until it returns false; returns its last value. Fields within a group, which our
+/// messages do not have, are counted as if they were outside: never fewer than there are.
 fn walk<'a>(mut bytes: &'a [u8], seen: &mut dyn FnMut(&'a [u8]) -> bool) -> bool {
     while !bytes.is_empty() {
         let Ok(tag) = decode_varint(&mut bytes) else { return true };
@@ -75,7 +75,7 @@ mod tests {
     use prost::Message as _;
 
     #[test]
-    fn a_large_honest_request_passes() {
+    fn a_large_valid_request_passes() {
         let id = |k: usize| format!("agent-{k}");
         let pair = |k: usize| v1::PairRef { agent_id: id(k), goal_id: id(k + 1), ..Default::default() };
         let team = v1::AssignRequest {
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn elements_of_nothing_are_counted_however_they_are_wrapped() {
+    fn empty_elements_are_counted_however_they_are_nested() {
         let empty_teams = v1::AssignManyRequest { teams: vec![v1::AssignRequest::default(); 4000] }.encode_to_vec();
         assert!(check::<v1::AssignManyRequest>(&empty_teams).is_err());
         let pairs = vec![v1::PairRef::default(); 200_000];
@@ -104,13 +104,13 @@ mod tests {
             .is_err()
         );
         assert!(check::<v1::AssignManyRequest>(&v1::AssignManyRequest { teams: vec![team] }.encode_to_vec()).is_err());
-        // Field 99 as a group, with something in it, in front: it hides nothing.
+        // Field 99 as a group in front: it hides nothing.
         let grouped = [&[0x9b, 0x06, 0x08, 0x01, 0x9c, 0x06][..], &plain].concat();
         assert!(check::<v1::AssignRequest>(&grouped).is_err());
     }
 
     #[test]
-    fn what_cannot_be_read_is_left_to_the_decoder() {
+    fn malformed_bytes_are_left_to_the_decoder() {
         for bytes in [&[0xff][..], &[0x0a, 0x05, 0x01], &[0x0a, 0xff], &[0x09, 0x00], &[0x0f], &[0x08, 0xff]] {
             check::<v1::AssignRequest>(bytes).unwrap();
             check::<v1::AssignManyRequest>(bytes).unwrap();

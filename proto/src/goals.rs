@@ -1,4 +1,4 @@
-//! What an actor asks of the commander, and the answer.
+//! An actor's request to the commander for the goals of a shard, and the reply.
 
 use crate::convert;
 use crate::{arrays, v1};
@@ -6,62 +6,72 @@ use magex_core::error::FieldError;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use std::fmt;
 
-/// What hands out goals.
+/// How goals are assigned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum SchedulerKind {
-    /// The trained Goal Commander.
+pub enum AssignmentMethod {
+    /// The trained scheduler of a run.
     #[default]
     Learned,
-    /// The least summed distance.
+    /// The smallest summed cost.
     Exact,
-    /// The nearest free pair, again and again.
+    /// The cheapest remaining pair, repeatedly.
     Greedy,
     /// A uniformly random matching.
     Random,
-    /// The smallest largest distance.
+    /// The smallest largest cost.
     Makespan,
 }
 
-impl fmt::Display for SchedulerKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+impl AssignmentMethod {
+    /// All methods.
+    pub const ALL: [Self; 5] = [Self::Learned, Self::Exact, Self::Makespan, Self::Greedy, Self::Random];
+
+    /// Its name in metrics, options and documentation.
+    pub fn name(self) -> &'static str {
+        match self {
             Self::Learned => "learned",
             Self::Exact => "exact",
             Self::Greedy => "greedy",
             Self::Random => "random",
             Self::Makespan => "makespan",
-        })
-    }
-}
-
-impl From<SchedulerKind> for v1::SchedulerKind {
-    fn from(kind: SchedulerKind) -> Self {
-        match kind {
-            SchedulerKind::Learned => Self::Learned,
-            SchedulerKind::Exact => Self::Exact,
-            SchedulerKind::Greedy => Self::Greedy,
-            SchedulerKind::Random => Self::Random,
-            SchedulerKind::Makespan => Self::ExactMakespan,
         }
     }
 }
 
-impl From<v1::SchedulerKind> for SchedulerKind {
-    fn from(kind: v1::SchedulerKind) -> Self {
+impl fmt::Display for AssignmentMethod {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl From<AssignmentMethod> for v1::AssignmentMethod {
+    fn from(kind: AssignmentMethod) -> Self {
         match kind {
-            v1::SchedulerKind::Unspecified | v1::SchedulerKind::Learned => Self::Learned,
-            v1::SchedulerKind::Exact => Self::Exact,
-            v1::SchedulerKind::Greedy => Self::Greedy,
-            v1::SchedulerKind::Random => Self::Random,
-            v1::SchedulerKind::ExactMakespan => Self::Makespan,
+            AssignmentMethod::Learned => Self::Learned,
+            AssignmentMethod::Exact => Self::Exact,
+            AssignmentMethod::Greedy => Self::Greedy,
+            AssignmentMethod::Random => Self::Random,
+            AssignmentMethod::Makespan => Self::Makespan,
         }
     }
 }
 
-/// Which weights are to answer.
+impl From<v1::AssignmentMethod> for AssignmentMethod {
+    fn from(kind: v1::AssignmentMethod) -> Self {
+        match kind {
+            v1::AssignmentMethod::Unspecified | v1::AssignmentMethod::Learned => Self::Learned,
+            v1::AssignmentMethod::Exact => Self::Exact,
+            v1::AssignmentMethod::Greedy => Self::Greedy,
+            v1::AssignmentMethod::Random => Self::Random,
+            v1::AssignmentMethod::Makespan => Self::Makespan,
+        }
+    }
+}
+
+/// The weights that a request names.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct WeightsKey {
-    /// Run that they belong to.
+    /// Run of the weights.
     pub run_id: RunId,
     /// Their version.
     pub version: WeightsVersion,
@@ -69,16 +79,14 @@ pub struct WeightsKey {
     pub sha256: String,
 }
 
-/// The teams of one shard. What is random in the answer is keyed by (seed, shard), so that the answer is a pure function of
-/// the request and the weights that `shard.version` names.
+/// The teams of one shard. Random choices are keyed by (seed, shard), so that the reply is a pure function of the request and
+/// the weights that `shard.version` names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GoalRequest {
-    /// The shard: kind, iteration, index, set and first episode are keys; version and mode are orders.
+    /// The shard: kind, iteration, index, set and first episode are keys; version and mode are instructions.
     pub shard: Shard,
     /// Seed of the run.
     pub seed: u64,
-    /// What hands out the goals.
-    pub scheduler: SchedulerKind,
     /// K: assignment problems per episode, in order; see `TaskConfig::stages`.
     pub stages: usize,
     /// N: agents per problem.
@@ -102,12 +110,12 @@ pub struct GoalReply {
     pub log_probs: Vec<f32>,
     /// [B, K] summed distance of each assignment, world units.
     pub costs: Vec<f32>,
-    /// [B, K] least summed distance possible, world units.
+    /// [B, K] smallest possible summed distance, world units.
     pub exact_costs: Vec<f32>,
 }
 
 impl GoalRequest {
-    /// The message that asks these weights.
+    /// The message of a request to these weights.
     pub fn to_message(&self, weights: &WeightsKey) -> v1::AssignBatchRequest {
         let b = self.shard.episodes as usize;
         v1::AssignBatchRequest {
@@ -115,30 +123,28 @@ impl GoalRequest {
             sha256: weights.sha256.clone(),
             seed: self.seed,
             shard: Some((&self.shard).into()),
-            scheduler: v1::SchedulerKind::from(self.scheduler).into(),
             agents: Some(arrays::from_f32(&[b, self.stages, self.agent_count, self.dims], &self.agents)),
             goals: Some(arrays::from_f32(&[b, self.stages, self.goal_count, self.dims], &self.goals)),
         }
     }
 
-    /// Reads a message: the request, and the weights that are to answer. Positions are finite afterwards.
+    /// Reads a message: the request, and the weights that it names.
+    ///
+    /// # Errors
+    /// The first field that is invalid. Positions are finite afterwards.
     pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), FieldError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
-        let scheduler = v1::SchedulerKind::try_from(message.scheduler)
-            .map_err(|_| FieldError::new("scheduler", format!("{} is unknown", message.scheduler)))?
-            .into();
         let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;
         let goal_shape = arrays::shape_of("goals", message.goals.as_ref(), 4)?;
         let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
         let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
         let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
         if stages == 0 {
-            return Err(FieldError::new("agents", "no stage; send at least one assignment problem per episode"));
+            return Err(FieldError::new("agents", "0 stages; send at least one assignment problem per episode"));
         }
         let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
-        let request =
-            Self { shard, seed: message.seed, scheduler, stages, agent_count, goal_count, dims, agents, goals };
+        let request = Self { shard, seed: message.seed, stages, agent_count, goal_count, dims, agents, goals };
         Ok((request, WeightsKey { run_id: RunId(message.run_id), version, sha256: message.sha256 }))
     }
 }
@@ -156,11 +162,15 @@ impl GoalReply {
         }
     }
 
-    /// Reads the answer to a request: shapes fit, numbers are finite, and goals exist.
+    /// Reads the reply to a request: shapes match, numbers are finite, and goals exist.
+    ///
+    /// # Errors
+    /// The first field that is invalid.
     pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, FieldError> {
         let problems = [request.shard.episodes as usize, request.stages];
         if message.version != request.shard.version.0 {
-            let problem = format!("version {} answered, {} was asked", message.version, request.shard.version);
+            let problem =
+                format!("version {} answered a request to version {}", message.version, request.shard.version);
             return Err(FieldError::new("version", problem));
         }
         let goals = arrays::to_u32("goals", message.goals, &[problems[0], problems[1], request.agent_count])?;
@@ -201,8 +211,8 @@ mod tests {
             record: false,
         };
         let points: Vec<f32> = (0..8).map(|i| i as f32).collect();
-        let (seed, scheduler, goals) = (5, SchedulerKind::Exact, points.clone());
-        GoalRequest { shard, seed, scheduler, stages: 1, agent_count: 2, goal_count: 2, dims: 2, agents: points, goals }
+        let (seed, goals) = (5, points.clone());
+        GoalRequest { shard, seed, stages: 1, agent_count: 2, goal_count: 2, dims: 2, agents: points, goals }
     }
 
     #[test]
@@ -223,23 +233,16 @@ mod tests {
     }
 
     #[test]
-    fn a_request_without_a_stage_is_refused() {
+    fn a_request_without_a_stage_is_rejected() {
         let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
         let empty = GoalRequest { stages: 0, agents: vec![], goals: vec![], ..request() };
         assert!(
-            GoalRequest::from_message(empty.to_message(&key)).unwrap_err().to_string().starts_with("agents: no stage")
+            GoalRequest::from_message(empty.to_message(&key)).unwrap_err().to_string().starts_with("agents: 0 stages")
         );
     }
 
     #[test]
-    fn an_unknown_scheduler_is_refused() {
-        let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
-        let message = v1::AssignBatchRequest { scheduler: 77, ..request().to_message(&key) };
-        assert_eq!(GoalRequest::from_message(message).unwrap_err().to_string(), "scheduler: 77 is unknown");
-    }
-
-    #[test]
-    fn a_position_that_is_not_a_number_is_named() {
+    fn a_position_that_is_not_finite_is_named() {
         let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(1), sha256: "ab".into() };
         let mut bad = request();
         bad.goals[3] = f32::NAN;

@@ -1,12 +1,12 @@
-//! Long byte strings as a sequence of parts, each with its own checksum, and back within a limit.
+//! Splits long byte strings into parts with checksums, and joins them within a limit.
 
 use crate::{PART_BYTES, v1::Part};
 use bytes::Bytes;
 
-/// Why parts do not make a whole.
+/// Why parts cannot be joined.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PartError {
-    /// The whole would be longer than allowed.
+    /// The byte string exceeds the limit.
     #[error("total_bytes: {total} bytes are more than the limit of {limit}")]
     TooLong {
         /// Announced length, bytes.
@@ -24,10 +24,10 @@ pub enum PartError {
         /// Index that was expected.
         expected: u32,
     },
-    /// The parts disagree about the whole, or do not fill it.
+    /// The parts disagree about the total length, or do not fill it.
     #[error("data: {0}")]
     Inconsistent(String),
-    /// The data were changed on their way.
+    /// The data was damaged in transit.
     #[error("crc32c: part {index} has checksum {actual:08x}, its sender says {claimed:08x}")]
     Checksum {
         /// Index of the part.
@@ -39,7 +39,7 @@ pub enum PartError {
     },
 }
 
-/// Cuts a byte string into parts of at most [`PART_BYTES`]; an empty one is a single empty part. Shares the bytes.
+/// Splits a byte string into parts of at most [`PART_BYTES`]; an empty one is a single empty part. Shares the bytes.
 pub fn split(whole: Bytes) -> impl ExactSizeIterator<Item = Part> {
     let total = whole.len().div_ceil(PART_BYTES).max(1);
     let total_bytes = whole.len() as u64;
@@ -49,7 +49,7 @@ pub fn split(whole: Bytes) -> impl ExactSizeIterator<Item = Part> {
     })
 }
 
-/// Puts parts together again, one byte string at a time. Any error, and any part 0, begins anew.
+/// Joins parts, one byte string at a time. An error, or a part 0, starts a new one.
 #[derive(Debug)]
 pub struct Assembler {
     limit: usize,
@@ -65,7 +65,7 @@ impl Assembler {
         Self { limit, next: 0, total: 0, total_bytes: 0, buffer: Vec::new() }
     }
 
-    /// Takes the next part; the last one gives the whole.
+    /// Adds the next part; the last one returns the byte string.
     pub fn push(&mut self, part: Part) -> Result<Option<Bytes>, PartError> {
         let taken = self.take(part);
         if !matches!(taken, Ok(None)) {

@@ -9,13 +9,13 @@ use magex_core::ids::{RunId, WeightsVersion};
 /// SHA-256 as lower-case hex.
 pub use magex_core::sha256::hex as sha256_hex;
 
-/// Longest weights that a subscriber takes, bytes.
+/// Maximum size of weights that a subscriber accepts, bytes.
 pub const MAX_WEIGHTS_BYTES: usize = 1 << 30;
 
-/// One version of the weights of executor and commander. Never changes once made.
+/// One version of the weights of executor and commander; immutable.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Weights {
-    /// Run that they belong to.
+    /// Run of the weights.
     pub run_id: RunId,
     /// Their version.
     pub version: WeightsVersion,
@@ -43,7 +43,7 @@ impl Weights {
     }
 }
 
-/// Makes weights of the messages of a weights stream. Nothing unverified leaves it.
+/// Joins the messages of a weights stream and verifies the hash before it returns weights.
 #[derive(Debug)]
 pub struct WeightsAssembler {
     parts: Assembler,
@@ -57,7 +57,7 @@ impl Default for WeightsAssembler {
 }
 
 impl WeightsAssembler {
-    /// Takes the next message; the last of a version gives the weights and the run's configuration (TOML).
+    /// Adds the next message; the last one of a version returns the weights and the run's configuration (TOML).
     pub fn push(&mut self, message: WatchWeightsResponse) -> Result<Option<(Weights, String)>, FieldError> {
         let part = message.part.ok_or_else(|| FieldError::missing("part"))?;
         if part.index == 0 {

@@ -5,8 +5,8 @@ use magex_actor::goal_client::GoalSource;
 use magex_actor::policy_worker::PolicyWorker;
 use magex_actor::run::ActorConfig;
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
-use magex_commander::service::CommanderConfig;
-use magex_commander::trained::load_scheduler;
+use magex_commander::run_scheduler::load_scheduler;
+use magex_commander::service::ServiceConfig;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::{RunId, Shard};
 use magex_core::trajectory::ShardResult;
@@ -90,7 +90,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
         tokio::spawn(async move { served.serve(incoming, token).await });
         let (incoming, commander) = server::bind("127.0.0.1:0").await.unwrap();
         let learner_url = Some(format!("http://{learner}"));
-        let config = CommanderConfig { learner_url, ..CommanderConfig::default() };
+        let config = ServiceConfig { learner_url, ..ServiceConfig::default() };
         tokio::spawn(magex_commander::service::run(config, load_scheduler, incoming, stop.clone()));
         let learner = match bytes_per_second {
             Some(rate) => relay(learner, rate).await,

@@ -1,8 +1,8 @@
 //! Untrusted bytes: a fixed number of damaged copies of good examples goes through every decoder.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_commander::service::CommanderConfig;
-use magex_commander::trained::load_scheduler;
+use magex_commander::run_scheduler::load_scheduler;
+use magex_commander::service::ServiceConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
 use magex_core::statics::Statics;
@@ -48,7 +48,7 @@ fn team() -> v1::AssignRequest {
         goals: points(&[0.0, 1.0, 4.0, 1.0, 8.0, 2.0]),
         agent_ids: ["a", "b", "c"].map(str::to_owned).to_vec(),
         goal_ids: ["x", "y", "z"].map(str::to_owned).to_vec(),
-        scheduler: v1::SchedulerKind::Exact.into(),
+        scheduler: v1::AssignmentMethod::Exact.into(),
         forbidden: vec![pair("a", "x")],
         cost_overrides: vec![v1::PairCost { pair: Some(pair("b", "y")), cost: 0.5 }],
         current: vec![pair("c", "y")],
@@ -60,10 +60,10 @@ fn team() -> v1::AssignRequest {
 
 fn requests() -> Vec<Vec<u8>> {
     let kinds = [
-        v1::SchedulerKind::Exact,
-        v1::SchedulerKind::ExactMakespan,
-        v1::SchedulerKind::Greedy,
-        v1::SchedulerKind::Random,
+        v1::AssignmentMethod::Exact,
+        v1::AssignmentMethod::Makespan,
+        v1::AssignmentMethod::Greedy,
+        v1::AssignmentMethod::Random,
     ];
     let mut examples: Vec<_> =
         kinds.map(|kind| v1::AssignRequest { scheduler: kind.into(), ..team() }.encode_to_vec()).to_vec();
@@ -223,7 +223,7 @@ async fn the_whole_commander() {
     let (incoming, address) = server::bind("127.0.0.1:0").await.unwrap();
     let stop = CancellationToken::new();
     let serving =
-        tokio::spawn(magex_commander::service::run(CommanderConfig::default(), load_scheduler, incoming, stop.clone()));
+        tokio::spawn(magex_commander::service::run(ServiceConfig::default(), load_scheduler, incoming, stop.clone()));
     let channel = client::endpoint(&format!("http://{address}")).unwrap().connect().await.unwrap();
     let many = v1::AssignManyRequest { teams: vec![team(), team()] }.encode_to_vec();
     let mut calls = [

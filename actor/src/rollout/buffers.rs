@@ -6,7 +6,7 @@ use magex_core::statics::{LANDMARKS, Statics};
 use magex_core::task::Stage;
 use magex_core::trajectory::Shape;
 use magex_env::{Env, EnvError};
-use magex_proto::goals::{GoalRequest, SchedulerKind};
+use magex_proto::goals::GoalRequest;
 
 /// The joint states of B episodes at one step, read from the environment.
 pub(super) struct Buffers {
@@ -58,7 +58,6 @@ impl Buffers {
         GoalRequest {
             shard: *shard,
             seed,
-            scheduler: SchedulerKind::Learned,
             stages: stages.len(),
             agent_count: shape.agents,
             goal_count: shape.agents,

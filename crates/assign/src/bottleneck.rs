@@ -38,7 +38,7 @@ pub fn bottleneck(cost: &[f64], rows: usize, cols: usize) -> Result<Bottleneck, 
 
 impl BottleneckSolver {
     /// [`bottleneck`] where a cost of +∞ forbids a pair: as many pairs as possible, among those the smallest largest
-    /// cost, and among those the smallest sum. Gives up as soon as `go_on` says no.
+    /// cost, and among those the smallest sum. Stops as soon as `should_continue` returns false.
     ///
     /// # Errors
     /// As [`Solver::solve_allowed`].
@@ -47,10 +47,10 @@ impl BottleneckSolver {
         cost: &[f64],
         rows: usize,
         cols: usize,
-        go_on: &dyn Fn() -> bool,
+        should_continue: &dyn Fn() -> bool,
     ) -> Result<Bottleneck, AssignError> {
         check_allowed(cost, rows, cols)?;
-        self.search(cost, rows, cols, go_on)
+        self.search(cost, rows, cols, should_continue)
     }
 
     /// Gives back the memory of a problem of more than `cells` pairs.
@@ -65,7 +65,7 @@ impl BottleneckSolver {
         cost: &[f64],
         rows: usize,
         cols: usize,
-        go_on: &dyn Fn() -> bool,
+        should_continue: &dyn Fn() -> bool,
     ) -> Result<Bottleneck, AssignError> {
         let Self { solver, matcher, values } = self;
         values.clear();
@@ -79,12 +79,12 @@ impl BottleneckSolver {
         values.dedup();
         let pairs = match none_forbidden {
             true => rows.min(cols),
-            false => matcher.run(cost, rows, cols, values[values.len() - 1], go_on)?,
+            false => matcher.run(cost, rows, cols, values[values.len() - 1], should_continue)?,
         };
         let (mut low, mut high) = (0, values.len() - 1);
         while low < high {
             let middle = low + (high - low) / 2;
-            if matcher.run(cost, rows, cols, values[middle], go_on)? == pairs {
+            if matcher.run(cost, rows, cols, values[middle], should_continue)? == pairs {
                 high = middle;
             } else {
                 low = middle + 1;
@@ -93,12 +93,12 @@ impl BottleneckSolver {
         let largest = values[low];
         values.clear();
         values.extend(cost.iter().map(|&value| if value <= largest { value } else { f64::INFINITY }));
-        let assignment = solver.solve_allowed(values, rows, cols, go_on)?;
+        let assignment = solver.solve_allowed(values, rows, cols, should_continue)?;
         // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
         if assignment.pairs().count() == pairs {
             return Ok(Bottleneck { assignment, largest });
         }
-        matcher.run(cost, rows, cols, largest, go_on)?;
+        matcher.run(cost, rows, cols, largest, should_continue)?;
         let col_of_row = matcher.col_of_row.clone();
         let sum = cost_of(cost, cols, &col_of_row);
         Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
@@ -121,16 +121,16 @@ pub(crate) struct Matcher {
 }
 
 impl Matcher {
-    /// Size of the largest matching. `go_on` is asked before every round of paths of the same length.
+    /// Size of the largest matching. `should_continue` is called before every round of paths of the same length.
     pub(crate) fn run(
         &mut self,
         cost: &[f64],
         rows: usize,
         cols: usize,
         threshold: f64,
-        go_on: &dyn Fn() -> bool,
+        should_continue: &dyn Fn() -> bool,
     ) -> Result<usize, AssignError> {
-        if !go_on() {
+        if !should_continue() {
             return Err(AssignError::Interrupted);
         }
         self.edges.clear();
@@ -146,7 +146,7 @@ impl Matcher {
         self.row_of_col.resize(cols, NONE);
         let mut matched = 0;
         while self.layers(rows) {
-            if !go_on() {
+            if !should_continue() {
                 return Err(AssignError::Interrupted);
             }
             self.cursor.clear();

@@ -43,7 +43,7 @@ impl Default for Schedule {
 }
 
 impl Schedule {
-    /// For a problem of so many pairs: those too large to converge in a fraction of a second get fewer rounds.
+    /// For a problem of `pairs` pairs: problems too large to converge in a fraction of a second get fewer rounds.
     pub fn for_pairs(pairs: usize) -> Self {
         Self { rounds: (ROUND_PAIRS / pairs.max(1)).clamp(16, 128), ..Self::default() }
     }

@@ -82,7 +82,7 @@ impl Solver {
     }
 
     /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
-    /// Gives up as soon as `go_on` says no; it is asked once per agent that is hard to place.
+    /// Stops as soon as `should_continue` returns false; it is called once per shortest-path search.
     ///
     /// # Errors
     /// As [`Solver::solve`], and [`AssignError::Interrupted`].
@@ -91,11 +91,11 @@ impl Solver {
         cost: &[f64],
         rows: usize,
         cols: usize,
-        go_on: &dyn Fn() -> bool,
+        should_continue: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
         let span = check_allowed(cost, rows, cols)?;
         let penalty = if span.forbidden == 0 { None } else { Some(span.penalty(rows.min(cols))) };
-        self.solve_checked(cost, rows, cols, penalty, go_on)
+        self.solve_checked(cost, rows, cols, penalty, should_continue)
     }
 
     /// Solves what was checked, with `penalty` in the place of +∞; pairs that paid it are taken out again.
@@ -105,7 +105,7 @@ impl Solver {
         rows: usize,
         cols: usize,
         penalty: Option<f64>,
-        go_on: &dyn Fn() -> bool,
+        should_continue: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
         let wide = rows <= cols;
         let mut own = std::mem::take(&mut self.cost);
@@ -115,7 +115,7 @@ impl Solver {
         if !as_it_is {
             load(&mut own, self.stride, cost, rows, cols, penalty);
         }
-        let solved = self.run(if as_it_is { cost } else { &own }, rows.min(cols), rows.max(cols), go_on);
+        let solved = self.run(if as_it_is { cost } else { &own }, rows.min(cols), rows.max(cols), should_continue);
         self.cost = own;
         solved?;
         let mut col_of_row: Vec<u32> = if wide {
@@ -147,7 +147,13 @@ impl Solver {
         answer
     }
 
-    fn run(&mut self, cost: &[f64], rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    fn run(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError> {
         let stride = self.stride;
         refill(&mut self.price, stride, 0.0);
         refill(&mut self.row_of_col, stride, NONE);
@@ -167,7 +173,7 @@ impl Solver {
             self.shortlists.reset(rows);
         }
         for next in 0..self.free.len() {
-            if !go_on() {
+            if !should_continue() {
                 return Err(AssignError::Interrupted);
             }
             self.augment(cost, cols, self.free[next]);
@@ -175,7 +181,7 @@ impl Solver {
         Ok(())
     }
 
-    /// Gives back the memory of a problem of more than `cells` pairs.
+    /// Frees the buffers of a problem of more than `cells` pairs.
     pub fn forget_beyond(&mut self, cells: usize) {
         let large = self.price.len() * self.col_of_row.len() > cells;
         if large || self.cost.capacity() > cells {
@@ -183,7 +189,7 @@ impl Solver {
         }
     }
 
-    /// Column reduction: each column takes the price of its cheapest row, and the row if nobody has it yet. Then the
+    /// Column reduction: each column takes the price of its cheapest row, and the row itself if it is still free. Then the
     /// reduction transfer: a row chosen by one column only lowers that column's price as far as it stays its best.
     fn reduce_columns(&mut self, cost: &[f64], cols: usize) {
         let Self { stride, price, cheapest, row_of_col, col_of_row, still_free, .. } = self;
@@ -218,7 +224,7 @@ impl Solver {
     }
 
     /// Augmenting row reduction over the free rows: each takes its cheapest column at a price that makes the second
-    /// cheapest as good, and displaces the owner, who looks for another column at once.
+    /// cheapest as good, and displaces the owner, which searches for another column at once.
     fn reduce_rows(&mut self, cost: &[f64], rows: usize) {
         let Self { stride, price, row_of_col, col_of_row, free, still_free, .. } = self;
         still_free.clear();

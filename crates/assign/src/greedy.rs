@@ -15,8 +15,8 @@ pub fn greedy(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, Assi
     take(cost, rows, cols, &|| true)
 }
 
-/// The same where a cost of +∞ forbids a pair. It may end with fewer pairs than are possible. Gives up as soon as `go_on`
-/// says no.
+/// The same where a cost of +∞ forbids a pair. It may end with fewer pairs than are possible. Stops as soon as `should_continue`
+/// returns false.
 ///
 /// # Errors
 /// As [`crate::Solver::solve_allowed`].
@@ -24,13 +24,13 @@ pub fn greedy_allowed(
     cost: &[f64],
     rows: usize,
     cols: usize,
-    go_on: &dyn Fn() -> bool,
+    should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     check_allowed(cost, rows, cols)?;
-    take(cost, rows, cols, go_on)
+    take(cost, rows, cols, should_continue)
 }
 
-fn take(cost: &[f64], rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Result<Assignment, AssignError> {
+fn take(cost: &[f64], rows: usize, cols: usize, should_continue: &dyn Fn() -> bool) -> Result<Assignment, AssignError> {
     let allowed = cost.iter().enumerate().filter(|&(_, &value)| value < f64::INFINITY);
     let mut order: Vec<(u64, u64)> = allowed.map(|(place, &value)| (ascending(value), place as u64)).collect();
     let mut col_of_row = vec![UNASSIGNED; rows];
@@ -42,8 +42,8 @@ fn take(cost: &[f64], rows: usize, cols: usize, go_on: &dyn Fn() -> bool) -> Res
         if left == 0 {
             break;
         }
-        // What is small is there sooner than anybody could be asked.
-        if order.len() > CHUNK && !go_on() {
+        // A small problem is solved faster than a cancellation would be noticed.
+        if order.len() > CHUNK && !should_continue() {
             return Err(AssignError::Interrupted);
         }
         if end - start > CHUNK {

@@ -1,4 +1,4 @@
-//! Who goes where: assignment of agents to goals by distance.
+//! Assignment of agents to goals by distance.
 //!
 //! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 6), [`bottleneck()`] minimises the longest
 //! distance instead of the sum, [`greedy()`], [`random`] and [`two_swap`] are the baselines a learned commander is
@@ -33,7 +33,7 @@ pub const UNASSIGNED: u32 = u32::MAX;
 /// Largest magnitude of a cost. Sums along a path of any length stay finite below it.
 pub const LARGEST_COST: f64 = 1e300;
 
-/// Why an assignment problem was refused.
+/// Why an assignment problem is rejected.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum AssignError {
     /// No rows or no columns.
@@ -52,14 +52,14 @@ pub enum AssignError {
         /// Columns asked for.
         cols: usize,
     },
-    /// An array does not have the length its shape asks for.
+    /// An array does not have the length of its shape.
     #[error("{field}: {found} numbers, the shape asks for {expected}")]
     Size {
         /// Which array.
         field: &'static str,
         /// Its length.
         found: usize,
-        /// What the shape asks for.
+        /// The length of its shape.
         expected: usize,
     },
     /// NaN, infinite or beyond [`LARGEST_COST`].
@@ -84,17 +84,17 @@ pub enum AssignError {
         /// The coordinate.
         value: f32,
     },
-    /// The caller did not want the answer any more.
-    #[error("given up before the answer was found")]
+    /// The caller cancelled.
+    #[error("interrupted before an answer was found")]
     Interrupted,
-    /// A number that steers an algorithm is out of range.
+    /// A parameter is out of range.
     #[error("{field}: {value} is out of range; {remedy}")]
     Parameter {
         /// Which parameter.
         field: &'static str,
         /// Its value.
         value: f64,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
 }
@@ -128,6 +128,24 @@ pub(crate) fn pairs(col_of_row: &[u32]) -> impl Iterator<Item = (usize, usize)> 
 /// Sum of the costs `[rows, cols]` chosen by a column list, in row order with Neumaier's compensation.
 pub fn cost_of(cost: &[f64], cols: usize, col_of_row: &[u32]) -> f64 {
     compensated_sum(pairs(col_of_row).map(|(row, col)| cost[row * cols + col]))
+}
+
+/// Euclidean distance of two points, in double precision.
+pub fn distance(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Summed distance of an assignment, in double precision: agents `[N, dims]`, goals `[G, dims]`, `goal_of` `[N]` the goal of each
+/// agent. An agent without a goal ([`UNASSIGNED`]) costs nothing.
+pub fn cost_of_points(agents: &[f32], goals: &[f32], dims: usize, goal_of: &[u32]) -> f64 {
+    let mut total = 0.0;
+    for (agent, &goal) in agents.chunks_exact(dims).zip(goal_of) {
+        let start = goal as usize * dims;
+        if let Some(goal) = goals.get(start..start + dims) {
+            total += distance(agent, goal);
+        }
+    }
+    total
 }
 
 pub(crate) fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {

@@ -1,4 +1,4 @@
-//! Random assignment: the lower bound a commander is measured against.
+//! Random assignment: the baseline of a commander.
 
 use crate::bottleneck::Matcher;
 use crate::{AssignError, UNASSIGNED, check_allowed, check_shape};
@@ -13,7 +13,7 @@ pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>,
     let mut col_of_row = stream.permutation(rows.max(cols));
     col_of_row.truncate(rows);
     for col in &mut col_of_row {
-        // With more rows than columns, the numbers beyond the last column are the places without a partner.
+        // With more rows than columns, numbers beyond the last column mean no partner.
         if *col >= cols as u32 {
             *col = UNASSIGNED;
         }
@@ -22,7 +22,7 @@ pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>,
 }
 
 /// A random matching of as many pairs as possible where a cost of +∞ forbids a pair; uniform only if none is forbidden.
-/// Gives up as soon as `go_on` says no.
+/// Stops as soon as `should_continue` returns false.
 ///
 /// # Errors
 /// As [`crate::Solver::solve_allowed`].
@@ -31,7 +31,7 @@ pub fn random_allowed(
     rows: usize,
     cols: usize,
     stream: &mut Stream,
-    go_on: &dyn Fn() -> bool,
+    should_continue: &dyn Fn() -> bool,
 ) -> Result<Vec<u32>, AssignError> {
     if check_allowed(cost, rows, cols)?.forbidden == 0 {
         return random(rows, cols, stream);
@@ -43,7 +43,7 @@ pub fn random_allowed(
     let shuffled: Vec<f64> =
         row_order.iter().flat_map(|row| col_order.iter().map(move |col| entry(row, col))).collect();
     let mut matcher = Matcher::default();
-    matcher.run(&shuffled, rows, cols, 0.0, go_on)?;
+    matcher.run(&shuffled, rows, cols, 0.0, should_continue)?;
     let mut col_of_row = vec![UNASSIGNED; rows];
     for (place, &row) in row_order.iter().enumerate() {
         if let Some(&col) = col_order.get(matcher.col_of_row[place] as usize) {

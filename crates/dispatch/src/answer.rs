@@ -1,11 +1,11 @@
-//! A plan as an answer on the wire.
+//! Writes a plan as a response.
 
 use crate::UNASSIGNED;
 use crate::engine::Plan;
 use crate::problem::Problem;
 use magex_proto::v1;
 
-/// Writes the answer. Names of weights, the reason of a fallback and the time are the caller's.
+/// Writes the response. The caller adds the weights, the reason of a fallback and the time.
 pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     let (n, g) = (problem.agent_count, problem.goal_count);
     let mut response = v1::AssignResponse {
@@ -13,7 +13,7 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
         cost: plan.cost,
         exact_cost: plan.exact_cost,
         gap: gap(plan.cost, plan.exact_cost),
-        scheduler: v1::SchedulerKind::from(plan.scheduler).into(),
+        scheduler: v1::AssignmentMethod::from(plan.scheduler).into(),
         ..Default::default()
     };
     let mut free = vec![true; g];
@@ -43,14 +43,14 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     response.largest_cost = largest.unwrap_or(0.0);
     response.unassigned_goals.extend((0..g as u32).filter(|&goal| free[goal as usize]));
     response.agents_without_goal =
-        reasons(&response.unassigned_agents, &problem.agent_ids, &plan.hopeless.agents, n > g);
-    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, &plan.hopeless.goals, g > n);
+        reasons(&response.unassigned_agents, &problem.agent_ids, &plan.isolated.agents, n > g);
+    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, &plan.isolated.goals, g > n);
     let left = |(now, then): (&u32, &u32)| *then != UNASSIGNED && now != then;
     response.switches = plan.goal_of.iter().zip(&problem.current).filter(|pair| left(*pair)).count() as u32;
     response
 }
 
-/// cost / exact − 1, where that means anything.
+/// cost / exact − 1; `None` where it is undefined.
 pub(crate) fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
     let exact = exact?;
     if exact > 0.0 {
@@ -64,8 +64,8 @@ fn name(ids: &[String], index: usize) -> String {
     ids.get(index).cloned().unwrap_or_default()
 }
 
-fn reasons(left: &[u32], ids: &[String], hopeless: &[u32], outnumbered: bool) -> Vec<v1::Unassigned> {
-    let reason = |index: &u32| match hopeless.binary_search(index) {
+fn reasons(left: &[u32], ids: &[String], isolated: &[u32], outnumbered: bool) -> Vec<v1::Unassigned> {
+    let reason = |index: &u32| match isolated.binary_search(index) {
         Ok(_) => v1::UnassignedReason::Forbidden,
         Err(_) if outnumbered => v1::UnassignedReason::Outnumbered,
         Err(_) => v1::UnassignedReason::Conflict,

@@ -1,7 +1,7 @@
-//! Missions on disk: one redb file, one row per mission, every change durable before it is answered.
+//! Missions on disk: one redb file, one row per mission; every change is durable before it is acknowledged.
 //!
-//! After a write that failed the database refuses all others, and whether that write is in the file nobody knows. So the
-//! file is opened anew before the next one, and made what the service knows: that is what was acknowledged.
+//! After a failed write the database rejects all further writes, and it is unknown whether the failed write is in the file. So
+//! before the next write the file is reopened and made equal to the missions in memory, which are the acknowledged ones.
 
 use crate::mission::Mission;
 use redb::{Database, ReadableDatabase as _, ReadableTable as _, TableDefinition, TableError};
@@ -13,33 +13,33 @@ use std::time::{Duration, Instant};
 
 /// Mission name → record.
 const MISSIONS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("missions");
-/// What the file is.
+/// Properties of the file.
 const ABOUT: TableDefinition<'_, &str, u64> = TableDefinition::new("about");
-/// Format of the records; a file with a later one is refused.
-const FORMAT: u64 = 1;
-/// Memory for pages, bytes: the missions themselves are in memory anyway.
+/// Format of the records; a file with another one is rejected.
+const FORMAT: u64 = 2;
+/// Page cache, bytes: small, because the missions themselves are in memory.
 const CACHE: usize = 4 << 20;
-/// Opening a file reads all of it. A disk that is full is not tried with every call.
+/// Pause after a failed write before the file is reopened: opening reads all of it.
 pub const PAUSE: Duration = Duration::from_secs(1);
 
-/// Why the file cannot be used.
+/// Why the file is unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum DiskError {
     /// The database.
     #[error("{0}")]
     Database(Box<redb::Error>),
-    /// Another process has it.
-    #[error("another commander uses it; give each its own --data folder")]
+    /// Another process has opened it.
+    #[error("another commander uses it; give each commander its own --data folder")]
     InUse,
-    /// A later version of this program wrote it.
-    #[error("its format is {0}, this program knows {FORMAT}; use the program that wrote it, or another --data folder")]
+    /// Another version of this program wrote it.
+    #[error("{}; use that version, or another --data folder", other_format(.0))]
     Format(u64),
     /// A record is damaged.
-    #[error("the record of mission '{0}' cannot be read: {1}")]
+    #[error("the record of mission '{0}' is damaged: {1}")]
     Record(String, String),
-    /// It failed a moment ago.
-    #[error("the last write failed; the file is opened anew at the first change after {PAUSE:?}")]
-    Resting,
+    /// The last write failed less than [`PAUSE`] ago.
+    #[error("the last write failed; the file is reopened at the first change after {PAUSE:?}")]
+    Paused,
 }
 
 impl<E: Into<redb::Error>> From<E> for DiskError {
@@ -51,15 +51,23 @@ impl<E: Into<redb::Error>> From<E> for DiskError {
     }
 }
 
-/// Opens the database, or makes it.
+fn other_format(format: &u64) -> String {
+    let own = env!("CARGO_PKG_VERSION");
+    match format {
+        1 => format!("written by magex 0.1.0 (commit 389f705), which reads it; this is magex {own}"),
+        other => format!("its format is {other}; this is magex {own}, which reads format {FORMAT}"),
+    }
+}
+
+/// Opens or creates the database.
 type Opener = Box<dyn Fn() -> Result<Database, redb::Error> + Send + Sync>;
 
 /// The file.
 pub struct Disk {
     opener: Opener,
-    /// None after a failure.
+    /// `None` after a failed write.
     database: Option<Database>,
-    /// When it failed last.
+    /// Time of the last failed write.
     failed: Option<Instant>,
     pause: Duration,
 }
@@ -71,17 +79,17 @@ impl fmt::Debug for Disk {
 }
 
 impl Disk {
-    /// Opens the file, or makes it.
+    /// Opens or creates the file.
     ///
     /// # Errors
-    /// A file that cannot be opened, is in use, or is of a later format.
+    /// The file cannot be opened, is in use, or has another format.
     pub fn open(path: &Path) -> Result<Self, DiskError> {
         let path: PathBuf = path.to_owned();
         let opener = move || Ok(Database::builder().set_cache_size(CACHE).create(&path)?);
         Self::opened_by(Box::new(opener), PAUSE)
     }
 
-    /// The same with any database. After a failure it is opened again, though not within `pause`.
+    /// The same with any database, which is reopened at the earliest `pause` after a failed write.
     ///
     /// # Errors
     /// As [`Disk::open`].
@@ -94,9 +102,9 @@ impl Disk {
     /// All missions, by name.
     ///
     /// # Errors
-    /// The file, and a record that cannot be read.
+    /// The file cannot be read, or a record is damaged.
     pub fn load(&self) -> Result<Vec<Mission>, DiskError> {
-        let read = self.database.as_ref().ok_or(DiskError::Resting)?.begin_read()?;
+        let read = self.database.as_ref().ok_or(DiskError::Paused)?.begin_read()?;
         let table = read.open_table(MISSIONS)?;
         let mut missions = Vec::new();
         for row in table.iter()? {
@@ -107,10 +115,10 @@ impl Disk {
         Ok(missions)
     }
 
-    /// Writes and removes missions at once, durably. `kept` is all that was acknowledged.
+    /// Writes and removes missions in one durable transaction. `kept` are all acknowledged missions.
     ///
     /// # Errors
-    /// The file. Then nothing has changed for whoever asks this service, and the file is opened anew before the next change.
+    /// The write failed. Then nothing has changed for clients, and the file is reopened before the next change.
     pub fn change(
         &mut self,
         put: &[&Mission],
@@ -118,11 +126,11 @@ impl Disk {
         kept: &BTreeMap<String, Arc<Mission>>,
     ) -> Result<(), DiskError> {
         if self.database.is_none() && self.failed.is_some_and(|since| since.elapsed() < self.pause) {
-            return Err(DiskError::Resting);
+            return Err(DiskError::Paused);
         }
         let changed = self.try_change(put, remove, kept);
         if changed.is_err() {
-            // The file is let go of here, so that it can be opened again.
+            // Closes the file, so that it can be reopened.
             (self.database, self.failed) = (None, Some(Instant::now()));
         }
         changed
@@ -164,7 +172,7 @@ fn write(database: &Database, put: &[&Mission], remove: &[&str]) -> Result<(), D
     Ok(())
 }
 
-/// Makes the tables if there are none. A file that has them is only read: it opens on a full disk, too.
+/// Creates missing tables. A file that has them is only read, so that it opens on a full disk, too.
 fn prepare(database: &Database) -> Result<(), DiskError> {
     let read = database.begin_read()?;
     let format = match read.open_table(ABOUT) {
@@ -184,10 +192,10 @@ fn prepare(database: &Database) -> Result<(), DiskError> {
     Ok(())
 }
 
-/// Makes the file what is kept: without a change that was written although it failed, and with everything that was
-/// acknowledged even if the file was taken away.
+/// Makes the file equal to `kept`: removes a change that failed but was written, and restores every acknowledged mission even
+/// if the file was deleted.
 fn mirror(database: &Database, kept: &BTreeMap<String, Arc<Mission>>) -> Result<(), DiskError> {
-    let (mut same, mut strange) = (HashSet::new(), Vec::new());
+    let (mut same, mut unknown) = (HashSet::new(), Vec::new());
     {
         let read = database.begin_read()?;
         let table = read.open_table(MISSIONS)?;
@@ -196,13 +204,13 @@ fn mirror(database: &Database, kept: &BTreeMap<String, Arc<Mission>>) -> Result<
             match kept.get(id.value()) {
                 Some(mission) if mission.encode() == record.value() => drop(same.insert(mission.id())),
                 Some(_) => {}
-                None => strange.push(id.value().to_owned()),
+                None => unknown.push(id.value().to_owned()),
             }
         }
     }
     let put: Vec<&Mission> = kept.values().map(Arc::as_ref).filter(|mission| !same.contains(mission.id())).collect();
-    if put.is_empty() && strange.is_empty() {
+    if put.is_empty() && unknown.is_empty() {
         return Ok(());
     }
-    write(database, &put, &strange.iter().map(String::as_str).collect::<Vec<_>>())
+    write(database, &put, &unknown.iter().map(String::as_str).collect::<Vec<_>>())
 }

@@ -1,8 +1,11 @@
-//! Who goes where, for outside clients, without a network: a request is read and checked ([`problem`]), solved
-//! ([`engine`]), and answered ([`answer`]); a mission ([`mission`]) is a team that stays, planned again with every change
-//! and reluctant to send anybody elsewhere; [`missions`] keeps them, bounded in number and age, on disk ([`disk`]).
+//! Goal assignment for external clients (transport-independent).
 //!
-//! Whatever the input, the answer is a valid matching or an error that names the field.
+//! A request is parsed and checked ([`problem`]), solved ([`engine`]), and answered ([`answer`]). A mission ([`mission`]) is a
+//! persistent team: it is re-planned on every change, with a switching cost that favours current assignments. [`missions`] stores
+//! missions, bounded in number and age, in a file ([`disk`]). Missions are wire types on purpose: a mission's assignment is the
+//! message that clients receive and the record that is stored.
+//!
+//! For every input the answer is a valid matching or an error that names the field.
 
 pub mod answer;
 pub mod disk;
@@ -18,11 +21,11 @@ pub use problem::{Limits, Problem};
 /// Why there is no assignment.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DispatchError {
-    /// The request makes no sense; names the field.
+    /// A field of the request is invalid.
     #[error(transparent)]
     Invalid(#[from] magex_proto::convert::ConvertError),
-    /// Nobody wants the answer any more, or its time is over.
-    #[error("given up before the answer was found")]
+    /// The call ended or its deadline passed.
+    #[error("interrupted before an answer was found")]
     Interrupted,
 }
 

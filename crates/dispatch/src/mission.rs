@@ -1,5 +1,5 @@
-//! A mission: a team that stays. Its agents and goals appear, move, fail, finish and go; with every change it is planned
-//! again, and what changed is told with the reason.
+//! A mission: a persistent team. Its agents and goals are added, move, fail, finish and are removed; every change re-plans the
+//! mission and reports each changed assignment with its reason.
 
 mod changes;
 mod members;
@@ -10,55 +10,55 @@ use crate::{DispatchError, UNASSIGNED, answer};
 use changes::sentence;
 use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
-use magex_proto::goals::SchedulerKind;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
-use members::{Known, check_id, check_lengths, check_record, lifetime, merge, most_pairs, sticky_scheduler};
+use members::{MemberNames, check_id, check_lengths, check_record, lifetime, merge, most_pairs, sticky_scheduler};
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
-/// Longest text for people, bytes.
+/// Longest title, bytes.
 const LONGEST_TITLE: usize = 256;
-/// Bytes of a pair besides its names.
+/// Bytes of a pair without its names.
 const PAIR: usize = 24;
-/// Names of missions that are training episodes begin with this.
+/// Prefix of the names of training episodes.
 pub const TRAINING_PREFIX: &str = "training.";
 
-/// Longest life of a mission without an update, and most members of a side.
+/// Limits of a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MissionLimits {
-    /// Agents, and goals, of one mission.
+    /// Agents, and goals, of a mission.
     pub members: usize,
-    /// Milliseconds.
+    /// Lifetime without an update, milliseconds.
     pub lifetime_ms: i64,
 }
 
-/// A plan, and who made it.
+/// A plan and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Planned {
     /// The plan.
     pub plan: Plan,
-    /// Why something else than the scheduler asked for answered; empty otherwise.
+    /// Why another method than the requested one answered; empty otherwise.
     pub fallback_reason: String,
     /// Weights that answered: version, SHA-256, run.
     pub weights: Option<(u32, String, String)>,
 }
 
-/// Solves a problem with whatever is there.
+/// Solves a problem with the available methods.
 pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, DispatchError> + 'a;
 
-/// Agent, goal.
+/// Names of an agent and of a goal.
 type Names = (String, String);
 
-/// A mission and the assignment in force.
+/// A mission and its current assignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mission {
-    /// What clients see.
+    /// The part that clients see.
     pub assignment: v1::Assignment,
     forbidden: BTreeSet<Names>,
     overrides: BTreeMap<Names, f64>,
     lifetime_ms: i64,
 }
 
-/// What is kept on disk. Fields are only ever added.
+/// The record on disk.
 #[derive(Clone, PartialEq, prost::Message)]
 struct Record {
     #[prost(message, optional, tag = "1")]
@@ -72,22 +72,22 @@ struct Record {
 }
 
 impl Mission {
-    /// Bytes that it takes, as on the wire.
+    /// Its size on the wire, bytes.
     pub fn bytes(&self) -> usize {
         let pairs = self.forbidden.iter().chain(self.overrides.keys());
         magex_proto::encoded_len(&self.assignment)
             + pairs.map(|(agent, goal)| agent.len() + goal.len() + PAIR).sum::<usize>()
     }
 
-    /// Agents and goals.
+    /// Number of agents, and of goals.
     pub fn size(&self) -> (usize, usize) {
         (self.assignment.agents.len(), self.assignment.goals.len())
     }
 
-    /// A new mission, planned. `drawn_id` is its name if the request brings none; `now` is milliseconds since 1970.
+    /// Creates and plans a mission. `drawn_id` is its name if the request has none; `now` is milliseconds since 1970.
     ///
     /// # Errors
-    /// The first field that makes no sense.
+    /// The first invalid field, or the planner's error.
     pub fn create(
         request: v1::CreateMissionRequest,
         owner: &str,
@@ -99,7 +99,7 @@ impl Mission {
         let id = if request.mission_id.is_empty() { drawn_id.to_owned() } else { request.mission_id };
         check_id(&id)?;
         if request.title.len() > LONGEST_TITLE {
-            let problem = format!("{} bytes are more than {LONGEST_TITLE}", request.title.len());
+            let problem = format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len());
             return Err(DispatchError::invalid("title", problem));
         }
         check_lengths(
@@ -111,14 +111,14 @@ impl Mission {
                 ("cost_overrides", request.cost_overrides.len()),
             ],
         )?;
-        let kind = sticky_scheduler(request.scheduler)?.unwrap_or(SchedulerKind::Exact);
+        let kind = sticky_scheduler(request.scheduler)?.unwrap_or(AssignmentMethod::Exact);
         let mut mission = Self {
             assignment: v1::Assignment {
                 mission_id: id,
                 title: request.title,
                 source: v1::MissionSource::Client.into(),
                 owner: owner.to_owned(),
-                scheduler: v1::SchedulerKind::from(kind).into(),
+                scheduler: v1::AssignmentMethod::from(kind).into(),
                 switching_cost: switching_cost(request.switching_cost)?,
                 created_ms: now,
                 ..Default::default()
@@ -131,14 +131,14 @@ impl Mission {
         mission.forbid("forbidden", &request.forbidden)?;
         mission.price("cost_overrides", &request.cost_overrides)?;
         mission.check_size(limits)?;
-        mission.plan(&Departed::default(), now, planner)?;
+        mission.plan(&Removed::default(), now, planner)?;
         Ok(mission)
     }
 
-    /// The mission after an update, planned; this one stays as it is.
+    /// Computes and plans the next revision; this one is unchanged.
     ///
     /// # Errors
-    /// The first field that makes no sense.
+    /// The first invalid field, or the planner's error.
     pub fn update(
         &self,
         request: v1::UpdateMissionRequest,
@@ -160,17 +160,16 @@ impl Mission {
             ],
         )?;
         let mut next = self.clone();
-        let before = Departed { agents: Vec::new(), goals: Vec::new() };
-        let departed = next.remove(&request.remove_agents, &request.remove_goals, before)?;
+        let removed = next.remove(&request.remove_agents, &request.remove_goals)?;
         next.upsert(request.agents, request.goals, limits)?;
         next.forbid("forbid", &request.forbid)?;
-        let known = Known::of(&next.assignment);
+        let known = MemberNames::of(&next.assignment);
         for (k, pair) in request.allow.iter().enumerate() {
             let names = known.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
             next.forbidden.remove(&names);
         }
         next.price("cost_overrides", &request.cost_overrides)?;
-        let known = Known::of(&next.assignment);
+        let known = MemberNames::of(&next.assignment);
         for (k, pair) in request.clear_cost_overrides.iter().enumerate() {
             let names = known.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
             next.overrides.remove(&names);
@@ -179,10 +178,10 @@ impl Mission {
             next.assignment.switching_cost = switching_cost(cost)?;
         }
         if let Some(kind) = sticky_scheduler(request.scheduler)? {
-            next.assignment.scheduler = v1::SchedulerKind::from(kind).into();
+            next.assignment.scheduler = v1::AssignmentMethod::from(kind).into();
         }
         next.check_size(limits)?;
-        next.plan(&departed, now, planner)?;
+        next.plan(&removed, now, planner)?;
         Ok(next)
     }
 
@@ -191,7 +190,7 @@ impl Mission {
         &self.assignment.mission_id
     }
 
-    /// What is kept on disk.
+    /// Encodes the record on disk.
     pub fn encode(&self) -> Vec<u8> {
         let pair = |(agent, goal): &Names| v1::PairRef {
             agent_id: agent.clone(),
@@ -211,10 +210,10 @@ impl Mission {
         prost::Message::encode_to_vec(&record)
     }
 
-    /// What was kept on disk.
+    /// Decodes a record on disk.
     ///
     /// # Errors
-    /// Bytes that are not such a record, or that no mission can have written.
+    /// The bytes are no record, or not that of a valid mission.
     pub fn decode(bytes: &[u8]) -> Result<Self, ConvertError> {
         let record: Record =
             prost::Message::decode(bytes).map_err(|error| ConvertError::new("mission", error.to_string()))?;
@@ -244,33 +243,25 @@ impl Mission {
         Ok(())
     }
 
-    fn remove(
-        &mut self,
-        agents: &[String],
-        goals: &[String],
-        mut departed: Departed,
-    ) -> Result<Departed, DispatchError> {
+    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Removed, DispatchError> {
         let a = &mut self.assignment;
-        for (field, members, gone, list) in [
-            ("remove_agents", &mut a.agents, agents, &mut departed.agents),
-            ("remove_goals", &mut a.goals, goals, &mut departed.goals),
-        ] {
+        for (field, members, ids) in [("remove_agents", &mut a.agents, agents), ("remove_goals", &mut a.goals, goals)] {
             let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
-            if let Some(k) = gone.iter().position(|id| !left.remove(id.as_str())) {
+            if let Some(k) = ids.iter().position(|id| !left.remove(id.as_str())) {
                 return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
             }
-            let going: HashSet<&str> = gone.iter().map(String::as_str).collect();
-            members.retain(|member| !going.contains(member.id.as_str()));
-            list.extend_from_slice(gone);
+            let ids: HashSet<&str> = ids.iter().map(String::as_str).collect();
+            members.retain(|member| !ids.contains(member.id.as_str()));
         }
+        let removed = Removed { agents: agents.to_vec(), goals: goals.to_vec() };
         let (agents, goals): (HashSet<&String>, HashSet<&String>) = (agents.iter().collect(), goals.iter().collect());
         self.forbidden.retain(|(agent, goal)| !agents.contains(agent) && !goals.contains(goal));
         self.overrides.retain(|(agent, goal), _| !agents.contains(agent) && !goals.contains(goal));
-        Ok(departed)
+        Ok(removed)
     }
 
     fn forbid(&mut self, field: &str, pairs: &[v1::PairRef]) -> Result<(), DispatchError> {
-        let known = Known::of(&self.assignment);
+        let known = MemberNames::of(&self.assignment);
         for (k, pair) in pairs.iter().enumerate() {
             let names = known.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
             self.forbidden.insert(names);
@@ -279,7 +270,7 @@ impl Mission {
     }
 
     fn price(&mut self, field: &str, items: &[v1::PairCost]) -> Result<(), DispatchError> {
-        let known = Known::of(&self.assignment);
+        let known = MemberNames::of(&self.assignment);
         for (k, item) in items.iter().enumerate() {
             let path = format!("{field}[{k}]");
             let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{path}.pair")))?;
@@ -293,13 +284,13 @@ impl Mission {
         let most = most_pairs(limits);
         for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
             if count > most {
-                return Err(DispatchError::invalid(field, format!("{count} pairs are more than {most}")));
+                return Err(DispatchError::invalid(field, format!("{count} pairs exceed the limit of {most}")));
             }
         }
         Ok(())
     }
 
-    /// The members that take part, as a problem; `None` if a side is empty. With the places of its rows and columns.
+    /// The problem of the active members, with their indices as rows and columns; `None` if a side is empty.
     fn problem(&self) -> Option<(Problem, Vec<usize>, Vec<usize>)> {
         let a = &self.assignment;
         let active = |members: &[v1::Member]| -> Vec<usize> {
@@ -344,9 +335,9 @@ impl Mission {
         Some((problem, agents, goals))
     }
 
-    fn plan(&mut self, departed: &Departed, now: i64, planner: &Planner<'_>) -> Result<(), DispatchError> {
+    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), DispatchError> {
         let before = std::mem::take(&mut self.assignment.pairs);
-        // The problem looks at the pairs in force.
+        // The problem reads the current pairs.
         self.assignment.pairs.clone_from(&before);
         let solved = match self.problem() {
             Some((problem, agents, goals)) => {
@@ -387,24 +378,23 @@ impl Mission {
         };
         a.agents_without_goal = idle(&a.agents, &paired(|p| p.agent_index, &a.pairs), &idle_agents);
         a.goals_without_agent = idle(&a.goals, &paired(|p| p.goal_index, &a.pairs), &idle_goals);
-        self.explain(&before, departed);
+        self.explain(&before, removed);
         Ok(())
     }
 
-    /// Cost of a pair as things are now; `None` if it is not possible.
+    /// Present cost of a pair; `None` if it is not allowed.
     fn cost_of(&self, agent: &v1::Member, goal: &v1::Member) -> Option<f64> {
         let names = (agent.id.clone(), goal.id.clone());
         let active = |member: &v1::Member| member.state() == v1::MemberState::Active;
         if !active(agent) || !active(goal) || self.forbidden.contains(&names) {
             return None;
         }
-        let square = |(x, y): (&f32, &f32)| (f64::from(*x) - f64::from(*y)) * (f64::from(*x) - f64::from(*y));
-        let distance = || agent.position.iter().zip(&goal.position).map(square).sum::<f64>().sqrt();
+        let distance = || magex_assign::distance(&agent.position, &goal.position);
         Some(self.overrides.get(&names).copied().unwrap_or_else(distance))
     }
 
-    /// Fills in what changed against `before`, and why.
-    fn explain(&mut self, before: &[v1::Pair], departed: &Departed) {
+    /// Fills in the changes against `before`, with their reasons.
+    fn explain(&mut self, before: &[v1::Pair], removed: &Removed) {
         let a = &self.assignment;
         let member = |members: &[v1::Member]| -> HashMap<String, v1::Member> {
             members.iter().map(|m| (m.id.clone(), m.clone())).collect()
@@ -415,9 +405,9 @@ impl Mission {
         let new: BTreeMap<&str, &str> = a.pairs.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
         let kept: Option<f64> = old.iter().map(|(agent, goal)| cost(agent, goal)).sum();
         let saving = kept.filter(|_| old.len() == new.len() && !old.is_empty()).map(|kept| kept - a.cost);
-        let everybody: BTreeSet<&str> = old.keys().chain(new.keys()).copied().collect();
+        let all: BTreeSet<&str> = old.keys().chain(new.keys()).copied().collect();
         let mut changes = Vec::new();
-        for agent in everybody {
+        for agent in all {
             let (from, to) = (old.get(agent).copied(), new.get(agent).copied());
             if from == to {
                 continue;
@@ -426,7 +416,7 @@ impl Mission {
             let reason = match from {
                 None => v1::ChangeReason::Assigned,
                 Some(goal) => {
-                    match (state(&agents, agent), state(&goals, goal), departed.goals.iter().any(|id| id == goal)) {
+                    match (state(&agents, agent), state(&goals, goal), removed.goals.iter().any(|id| id == goal)) {
                         (None, ..) => v1::ChangeReason::AgentRemoved,
                         (Some(v1::MemberState::Failed), ..) => v1::ChangeReason::AgentFailed,
                         (Some(v1::MemberState::Finished), ..) => v1::ChangeReason::AgentFinished,
@@ -441,7 +431,7 @@ impl Mission {
                     }
                 }
             };
-            let reason = match departed.agents.iter().any(|id| id == agent) && from.is_some() {
+            let reason = match removed.agents.iter().any(|id| id == agent) && from.is_some() {
                 true => v1::ChangeReason::AgentRemoved,
                 false => reason,
             };
@@ -461,13 +451,13 @@ impl Mission {
 
 /// Members that an update removed.
 #[derive(Debug, Default)]
-struct Departed {
+struct Removed {
     agents: Vec<String>,
     goals: Vec<String>,
 }
 
-/// Members without a partner: those that do not take part, and those that the plan left over. Where a whole side is
-/// missing, the other outnumbers it.
+/// Members without a partner: inactive ones, and those that the plan left unassigned. If a side is empty, the other one
+/// outnumbers it.
 fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usize, i32>) -> Vec<v1::Unassigned> {
     let without = members.iter().enumerate().filter(|(k, _)| !paired.contains(k));
     without

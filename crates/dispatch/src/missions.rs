@@ -1,5 +1,7 @@
-//! All missions of a service: bounded in number and age, in memory, and on disk if there is one. Readers never wait for
-//! the disk.
+//! All missions of a service, in memory and optionally on disk, bounded in number and age. Readers never wait for the disk.
+//!
+//! An update computes revision r + 1 from revision r, writes it to disk, and commits it only if r is still current (optimistic
+//! concurrency). Otherwise the caller re-plans.
 
 use crate::disk::{Disk, DiskError};
 use crate::mission::{Mission, MissionLimits};
@@ -7,18 +9,18 @@ use magex_proto::v1;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-/// How many missions there may be, and how large and old they become.
+/// Limits of the missions of a service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// All missions.
+    /// Missions of all owners.
     pub total: usize,
-    /// Those of one owner.
+    /// Missions of one owner.
     pub per_owner: usize,
-    /// Bytes of all missions, as they are on the wire, with what changed last.
+    /// Bytes of all missions on the wire, including their latest changes.
     pub bytes: usize,
-    /// Bytes of one owner's: nobody takes all of them alone.
+    /// Bytes of the missions of one owner.
     pub owner_bytes: usize,
-    /// Size and life of each.
+    /// Limits of each mission.
     pub each: MissionLimits,
 }
 
@@ -29,43 +31,41 @@ impl Default for Bounds {
     }
 }
 
-/// Why a mission was not kept.
+/// Why a mission was not stored.
 #[derive(Debug, thiserror::Error)]
 pub enum KeepError {
-    /// The name is taken.
-    #[error("mission '{0}' exists")]
+    /// The name is in use.
+    #[error("mission_id: mission '{0}' exists; choose another name")]
     Exists(String),
-    /// There is none of this name.
+    /// There is no mission of this name.
     #[error("there is no mission '{0}'")]
     Missing(String),
-    /// Too many.
+    /// A limit is reached.
     #[error("{0}")]
     Full(String),
-    /// Somebody else changed it meanwhile.
-    #[error("mission '{id}' is at revision {found}")]
+    /// It changed concurrently.
+    #[error("mission '{id}' is at revision {found}; read it again")]
     Changed {
         /// Its name.
         id: String,
         /// Its revision now.
         found: u64,
     },
-    /// The service has ended.
+    /// The service has stopped.
     #[error("the missions are closed")]
     Closed,
     /// The disk.
-    #[error(
-        "the missions cannot be written, so nothing was changed: {0}; make room on the disk of --data and try again"
-    )]
+    #[error("the missions cannot be written, so nothing was changed: {0}; free space on the disk of --data and retry")]
     Disk(#[from] DiskError),
 }
 
 /// By name.
 type Kept = BTreeMap<String, Arc<Mission>>;
 
-/// Where changes go.
+/// Where changes are stored.
 #[derive(Debug)]
 enum Journal {
-    /// Nowhere: missions live as long as the process.
+    /// In memory only: missions are lost when the process ends.
     Memory,
     Disk(Disk),
     Closed,
@@ -81,9 +81,9 @@ impl Journal {
     }
 }
 
-/// What only a change needs.
+/// The state that only changes use.
 #[derive(Debug)]
-struct Writing {
+struct WriteState {
     journal: Journal,
     /// Bytes of each mission, of each owner's, and of all.
     sizes: HashMap<String, usize>,
@@ -91,8 +91,8 @@ struct Writing {
     bytes: usize,
 }
 
-impl Writing {
-    /// Counts a mission; `None` when it is gone. A mission never changes its owner.
+impl WriteState {
+    /// Sets the size of a mission; `None` when it is removed. A mission never changes its owner.
     fn resize(&mut self, mission: &Mission, size: Option<usize>) {
         let (id, owner) = (mission.id(), mission.assignment.owner.as_str());
         let before = match size {
@@ -117,31 +117,31 @@ impl Writing {
 #[derive(Debug)]
 pub struct Missions {
     kept: RwLock<Kept>,
-    /// Held by whoever changes something, from the check to the end of the write.
-    writing: Mutex<Writing>,
+    /// Held by a change from its check to the end of its write.
+    writing: Mutex<WriteState>,
     bounds: Bounds,
 }
 
 impl Missions {
-    /// Those on disk, if there is one; without it they live as long as the process.
+    /// Loads the missions of a file; without a file they are lost when the process ends.
     ///
     /// # Errors
-    /// The disk.
+    /// The file cannot be read.
     pub fn open(disk: Option<Disk>, bounds: Bounds) -> Result<Self, DiskError> {
         let loaded = disk.as_ref().map(Disk::load).transpose()?.unwrap_or_default();
         let journal = disk.map_or(Journal::Memory, Journal::Disk);
-        let mut writing = Writing { journal, sizes: HashMap::new(), owners: HashMap::new(), bytes: 0 };
+        let mut writing = WriteState { journal, sizes: HashMap::new(), owners: HashMap::new(), bytes: 0 };
         loaded.iter().for_each(|mission| writing.resize(mission, Some(mission.bytes())));
         let kept = loaded.into_iter().map(|mission| (mission.id().to_owned(), Arc::new(mission))).collect();
         Ok(Self { kept: RwLock::new(kept), writing: Mutex::new(writing), bounds })
     }
 
-    /// How many there are.
+    /// Number of missions.
     pub fn count(&self) -> usize {
         self.kept.read().unwrap_or_else(PoisonError::into_inner).len()
     }
 
-    /// The bounds in force.
+    /// The limits.
     pub fn bounds(&self) -> &Bounds {
         &self.bounds
     }
@@ -151,7 +151,7 @@ impl Missions {
         self.read().get(id).cloned()
     }
 
-    /// Up to `count` missions after this name that pass, by name.
+    /// Up to `count` missions after this name that pass the filter, by name.
     pub fn page(&self, after: &str, count: usize, pass: impl Fn(&Mission) -> bool) -> Vec<Arc<Mission>> {
         let beyond = (std::ops::Bound::Excluded(after), std::ops::Bound::Unbounded);
         self.read()
@@ -163,10 +163,10 @@ impl Missions {
             .collect()
     }
 
-    /// Keeps a new mission.
+    /// Stores a new mission.
     ///
     /// # Errors
-    /// Its name is taken, there are too many, or the disk.
+    /// Its name is in use, a limit is reached, or the write failed.
     pub fn insert(&self, mission: Mission) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         {
@@ -179,7 +179,7 @@ impl Missions {
         self.put(&mut writing, mission)
     }
 
-    /// Whether one more mission of this owner may be kept.
+    /// Whether one more mission of this owner may be stored.
     ///
     /// # Errors
     /// [`KeepError::Full`].
@@ -189,25 +189,28 @@ impl Missions {
 
     fn room(&self, kept: &Kept, owner: &str) -> Result<(), KeepError> {
         if kept.len() >= self.bounds.total {
-            return Err(KeepError::Full(format!("the service keeps {} missions; delete some", self.bounds.total)));
+            return Err(KeepError::Full(format!(
+                "the service is at its limit of {} missions; delete some",
+                self.bounds.total
+            )));
         }
         let own = kept.values().filter(|mission| mission.assignment.owner == owner).count();
         if own >= self.bounds.per_owner {
             return Err(KeepError::Full(format!(
-                "a client has at most {} missions; delete some",
+                "the client is at its limit of {} missions; delete some",
                 self.bounds.per_owner
             )));
         }
         Ok(())
     }
 
-    /// Keeps the successor of the mission's revision `was`.
+    /// Stores the successor of the mission's revision `was`.
     ///
     /// # Errors
-    /// It is gone or has another revision, or the disk.
+    /// The mission was deleted or has another revision, or the write failed.
     pub fn replace(&self, mission: Mission, was: u64) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
-        // Somebody else's that has taken the name meanwhile is none of this owner's business, not even that it is there.
+        // Another owner's mission of the same name must look like a missing one.
         match self.get(mission.id()).filter(|now| now.assignment.owner == mission.assignment.owner) {
             None => return Err(KeepError::Missing(mission.id().to_owned())),
             Some(now)
@@ -220,11 +223,10 @@ impl Missions {
         self.put(&mut writing, mission)
     }
 
-    /// Forgets a mission, if it is one that `may` be forgotten: looked at and removed in one step, so that what is removed
-    /// is what was looked at.
+    /// Deletes a mission if `may` allows it. Check and deletion are atomic.
     ///
     /// # Errors
-    /// There is none, or it may not (which is told as if there were none), or the disk.
+    /// There is no such mission, or `may` returned false (the same error), or the write failed.
     pub fn remove(&self, id: &str, may: impl FnOnce(&Mission) -> bool) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         let found = self.get(id).filter(|mission| may(mission));
@@ -235,10 +237,10 @@ impl Missions {
         Ok(mission)
     }
 
-    /// Forgets missions whose time is over at `now` (milliseconds since 1970), and returns them.
+    /// Deletes the missions that have expired at `now` (milliseconds since 1970), and returns them.
     ///
     /// # Errors
-    /// The disk.
+    /// The write failed.
     pub fn expire(&self, now: i64) -> Result<Vec<Arc<Mission>>, KeepError> {
         let mut writing = self.lock();
         let old: Vec<Arc<Mission>> =
@@ -255,24 +257,24 @@ impl Missions {
         Ok(old)
     }
 
-    /// Lets go of the disk. Nothing changes any more.
+    /// Closes the file; further changes fail.
     pub fn close(&self) {
         self.lock().journal = Journal::Closed;
     }
 
-    fn put(&self, writing: &mut Writing, mission: Mission) -> Result<Arc<Mission>, KeepError> {
+    fn put(&self, writing: &mut WriteState, mission: Mission) -> Result<Arc<Mission>, KeepError> {
         let size = mission.bytes();
         let before = writing.sizes.get(mission.id()).copied().unwrap_or(0);
-        // One that does not grow is always taken: it is how a full service gets smaller.
+        // A mission that does not grow is always accepted, so that a full service can shrink.
         if size > before {
             let (owned, bounds) = (writing.owned(&mission.assignment.owner), &self.bounds);
-            for (whose, taken, most) in
+            for (owner, used, limit) in
                 [("one client", owned, bounds.owner_bytes), ("all clients", writing.bytes, bounds.bytes)]
             {
-                if taken - before + size > most {
+                if used - before + size > limit {
                     let more = size - before;
                     let problem = format!(
-                        "the missions of {whose} may take {most} bytes; they take {taken}, and this would be {more} more; delete some"
+                        "the missions of {owner} may take {limit} bytes; {used} are used, and this one needs {more} more; delete some"
                     );
                     return Err(KeepError::Full(problem));
                 }
@@ -285,7 +287,7 @@ impl Missions {
         Ok(mission)
     }
 
-    // A thread that died between two steps left nothing half done: the map changes in one step.
+    // The map changes in one step, so a panic cannot leave it inconsistent.
     fn read(&self) -> RwLockReadGuard<'_, Kept> {
         self.kept.read().unwrap_or_else(PoisonError::into_inner)
     }
@@ -294,12 +296,12 @@ impl Missions {
         self.kept.write().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Writing> {
+    fn lock(&self) -> MutexGuard<'_, WriteState> {
         self.writing.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Whether a filter of sources lets one through.
+/// Whether a source passes a filter.
 pub fn passes(filter: v1::MissionSource, source: v1::MissionSource) -> bool {
     filter == v1::MissionSource::Unspecified || filter == source
 }

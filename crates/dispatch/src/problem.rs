@@ -1,28 +1,28 @@
-//! A request for one team, read and checked.
+//! Parses and checks a request for one team.
 
-use magex_assign::{UNASSIGNED, distances_into};
+use magex_assign::{UNASSIGNED, distance, distances_into};
 use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
-use magex_proto::goals::SchedulerKind;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::{arrays, v1};
 use std::collections::HashMap;
 use std::time::Duration;
 
-/// Largest magnitude of a cost that a client may give: sums and penalties stay finite with room to spare.
+/// Largest magnitude of a client's cost, so that sums and penalties stay finite.
 pub const LARGEST_COST: f64 = 1e100;
 
 /// Longest name of an agent or a goal, bytes.
 pub const LONGEST_ID: usize = 128;
 
-/// Longest deadline that can be asked for, seconds.
+/// Longest deadline of a request, seconds.
 pub const LONGEST_DEADLINE: f64 = 3600.0;
 
-/// What a request may ask for at most.
+/// Limits of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Agents, and goals, of one team.
+    /// Agents, and goals, of a team.
     pub members: usize,
-    /// Teams of one call.
+    /// Teams of a call.
     pub teams: usize,
 }
 
@@ -32,7 +32,7 @@ impl Default for Limits {
     }
 }
 
-/// One team with its costs: what is to be solved. Everything in it is finite and in range.
+/// The assignment problem of one team. All values are finite and in range.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
     /// N.
@@ -49,37 +49,42 @@ pub struct Problem {
     pub agent_ids: Vec<String>,
     /// `[G]` names, or none.
     pub goal_ids: Vec<String>,
-    /// `[N, G]` in the place of the distances.
+    /// `[N, G]` costs that replace the distances.
     pub matrix: Option<Vec<f64>>,
-    /// (agent, goal, cost) in the place of theirs; a later one wins.
+    /// (agent, goal, cost) of single pairs; a later entry replaces an earlier one.
     pub overrides: Vec<(u32, u32, f64)>,
-    /// (agent, goal) that must not be.
+    /// Forbidden (agent, goal) pairs.
     pub forbidden: Vec<(u32, u32)>,
-    /// `[N]` goal that each agent has now, or [`UNASSIGNED`]; or none.
+    /// `[N]` current goal of each agent, or [`UNASSIGNED`]; empty without current pairs.
     pub current: Vec<u32>,
-    /// What it costs that an agent leaves it.
+    /// Cost of an agent leaving its current goal.
     pub switching_cost: f64,
-    /// What is to hand out the goals.
-    pub scheduler: SchedulerKind,
-    /// How the learned scheduler chooses.
+    /// Requested method.
+    pub scheduler: AssignmentMethod,
+    /// How the learned method chooses.
     pub mode: Mode,
-    /// Key of what is random.
+    /// Key of the random choices.
     pub seed: u64,
-    /// After this time nobody wants the answer.
+    /// Deadline, from the arrival of the request.
     pub deadline: Option<Duration>,
 }
 
 impl Problem {
-    /// Checks a request. `seed` is used when it has none of its own.
+    /// Parses a request. `seed` is the seed of a request without one.
     ///
     /// # Errors
-    /// The first field that makes no sense, by its path.
+    /// The first invalid field, by its path.
     pub fn read(message: v1::AssignRequest, seed: u64, limits: &Limits) -> Result<Self, ConvertError> {
         let scheduler = scheduler("scheduler", message.scheduler)?.unwrap_or_default();
         let mode = match v1::Mode::try_from(message.mode) {
             Ok(v1::Mode::Sampled) => Mode::Sampled,
             Ok(v1::Mode::Greedy | v1::Mode::Unspecified) => Mode::Greedy,
-            Err(_) => return Err(ConvertError::new("mode", format!("{} is unknown", message.mode))),
+            Err(_) => {
+                return Err(ConvertError::new(
+                    "mode",
+                    format!("{} is not a mode; use sampled or greedy", message.mode),
+                ));
+            }
         };
         let positions = match (message.agents, message.goals) {
             (None, None) if message.costs.is_some() => None,
@@ -166,17 +171,19 @@ impl Problem {
     pub fn distance(&self, agent: usize, goal: usize) -> f64 {
         let d = self.dims;
         let (a, g) = (self.agents.get(agent * d..(agent + 1) * d), self.goals.get(goal * d..(goal + 1) * d));
-        let square = |(a, g): (&f32, &f32)| (f64::from(*a) - f64::from(*g)) * (f64::from(*a) - f64::from(*g));
-        a.unwrap_or_default().iter().zip(g.unwrap_or_default()).map(square).sum::<f64>().sqrt()
+        distance(a.unwrap_or_default(), g.unwrap_or_default())
     }
 }
 
-/// A scheduler that exists; `None` if none is named.
-pub(crate) fn scheduler(field: &str, value: i32) -> Result<Option<SchedulerKind>, ConvertError> {
-    match v1::SchedulerKind::try_from(value) {
-        Ok(v1::SchedulerKind::Unspecified) => Ok(None),
+/// A known method; `None` if unspecified.
+pub(crate) fn scheduler(field: &str, value: i32) -> Result<Option<AssignmentMethod>, ConvertError> {
+    match v1::AssignmentMethod::try_from(value) {
+        Ok(v1::AssignmentMethod::Unspecified) => Ok(None),
         Ok(kind) => Ok(Some(kind.into())),
-        Err(_) => Err(ConvertError::new(field, format!("{value} is unknown"))),
+        Err(_) => Err(ConvertError::new(
+            field,
+            format!("{value} is not a method; use learned, exact, makespan, greedy or random"),
+        )),
     }
 }
 
@@ -188,7 +195,7 @@ pub(crate) fn switching_cost(value: f64) -> Result<f64, ConvertError> {
 }
 
 pub(crate) fn finite_cost(value: f64, field: impl FnOnce() -> String) -> Result<f64, ConvertError> {
-    // Not so for NaN.
+    // False for NaN.
     if value.abs() <= LARGEST_COST {
         return Ok(value);
     }
@@ -221,7 +228,7 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
         return Err(ConvertError::new(format!("{field}.coordinates"), problem));
     }
     if values.len() / dims > limits.members {
-        let problem = format!("{} points are more than {}", values.len() / dims, limits.members);
+        let problem = format!("{} points exceed the limit of {}", values.len() / dims, limits.members);
         return Err(ConvertError::new(field, problem));
     }
     match values.iter().position(|value| !value.is_finite()) {
@@ -233,7 +240,7 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
     }
 }
 
-/// Checks a cost matrix against the number of points, if there are any.
+/// Checks a cost matrix against the number of positions, if there are any.
 fn matrix(
     costs: v1::CostMatrix,
     counts: Option<(usize, usize)>,
@@ -247,7 +254,7 @@ fn matrix(
             return Err(ConvertError::new(field, format!("{found} is not in 1..{}", limits.members)));
         }
         if let Some(points) = points.filter(|&points| points != found) {
-            return Err(ConvertError::new(field, format!("{found}, there are {points} positions")));
+            return Err(ConvertError::new(field, format!("{found}, but there are {points} positions")));
         }
     }
     if costs.values.len() != shape.0 * shape.1 {
@@ -260,7 +267,7 @@ fn matrix(
     Ok((costs.values, shape))
 }
 
-/// Place of every name; checks that there are as many names as members, or none, and no name twice.
+/// Index of every name. There must be as many names as members, or none, and all different.
 fn index<'a>(field: &str, ids: &'a [String], count: usize) -> Result<HashMap<&'a str, u32>, ConvertError> {
     let mut places = HashMap::new();
     if ids.is_empty() {
@@ -283,7 +290,7 @@ fn index<'a>(field: &str, ids: &'a [String], count: usize) -> Result<HashMap<&'a
     Ok(places)
 }
 
-/// Names and numbers of both sides.
+/// Names and sizes of both sides.
 struct Sides<'a> {
     agents: (&'a HashMap<&'a str, u32>, usize),
     goals: (&'a HashMap<&'a str, u32>, usize),

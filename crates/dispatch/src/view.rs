@@ -1,14 +1,15 @@
-//! An episode of a training run, seen as a mission that nobody can change.
+//! An episode of a training run as a read-only mission.
 
 use crate::engine::pairs;
 use crate::mission::TRAINING_PREFIX;
-use magex_proto::goals::SchedulerKind;
+use magex_assign::distance;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 
-/// An episode and what the commander handed out.
+/// An episode and its assignment.
 #[derive(Debug, Clone, Copy)]
 pub struct Episode<'a> {
-    /// Run that it belongs to.
+    /// Its run.
     pub run_id: &'a str,
     /// `train-<iteration>` or `eval-<set>`.
     pub part: &'a str,
@@ -22,19 +23,19 @@ pub struct Episode<'a> {
     pub goals: &'a [f32],
     /// `[N]` goal of each agent.
     pub goal_of: &'a [u32],
-    /// What answered.
-    pub scheduler: SchedulerKind,
+    /// Method that answered.
+    pub scheduler: AssignmentMethod,
     /// Weights that answered.
     pub version: u32,
     /// Their SHA-256.
     pub sha256: &'a str,
-    /// Summed distance as it was answered.
+    /// Summed distance of the answer.
     pub cost: f64,
-    /// Least possible.
+    /// Smallest possible summed distance.
     pub exact_cost: f64,
     /// When it was answered, milliseconds since 1970.
     pub at_ms: i64,
-    /// When it is shown no more, milliseconds since 1970.
+    /// Until when it is shown, milliseconds since 1970.
     pub expires_ms: i64,
 }
 
@@ -62,8 +63,7 @@ impl Episode<'_> {
         let possible = pairs(self.goal_of).filter(|&(agent, goal)| agent < agents.len() && goal < goals.len());
         let pairs: Vec<v1::Pair> = possible
             .map(|(agent, goal)| {
-                let square = |(x, y): (&f32, &f32)| (f64::from(*x) - f64::from(*y)).powi(2);
-                let distance = agents[agent].position.iter().zip(&goals[goal].position).map(square).sum::<f64>().sqrt();
+                let distance = distance(&agents[agent].position, &goals[goal].position);
                 v1::Pair {
                     agent_index: agent as u32,
                     goal_index: goal as u32,
@@ -80,7 +80,7 @@ impl Episode<'_> {
             let reason = v1::UnassignedReason::Outnumbered.into();
             free.map(|(k, m)| v1::Unassigned { index: k as u32, id: m.id.clone(), reason }).collect()
         };
-        let scheduler = v1::SchedulerKind::from(self.scheduler).into();
+        let scheduler = v1::AssignmentMethod::from(self.scheduler).into();
         v1::Assignment {
             mission_id: self.mission_id(),
             title: format!("{} episode {} of run {}", self.part, self.index, self.run_id),

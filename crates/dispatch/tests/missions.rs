@@ -1,4 +1,4 @@
-//! The life of missions: who changes goals and why, what survives, and what is refused.
+//! The life of missions: why goals change, what survives, and what is rejected.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
@@ -107,8 +107,8 @@ fn failures_ends_and_removals_are_told_apart() {
     let agents = |s| v1::UpdateMissionRequest { agents: vec![state("a", s)], ..Default::default() };
     let goals_ = |s| v1::UpdateMissionRequest { goals: vec![state("x", s)], ..Default::default() };
     // The other agent is far away: it keeps its own goal.
-    let (told, next) = one(agents(MemberState::Failed));
-    assert_eq!(told, [("a".to_owned(), ChangeReason::AgentFailed)]);
+    let (changed, next) = one(agents(MemberState::Failed));
+    assert_eq!(changed, [("a".to_owned(), ChangeReason::AgentFailed)]);
     assert_eq!(next.assignment.agents_without_goal[0].reason(), UnassignedReason::Inactive);
     assert_eq!(next.assignment.goals_without_agent[0].reason(), UnassignedReason::Outnumbered);
     assert_eq!(one(agents(MemberState::Finished)).0, [("a".to_owned(), ChangeReason::AgentFinished)]);
@@ -119,9 +119,9 @@ fn failures_ends_and_removals_are_told_apart() {
     let removed = v1::UpdateMissionRequest { remove_goals: vec!["x".into()], ..Default::default() };
     assert_eq!(one(removed).0, [("a".to_owned(), ChangeReason::GoalRemoved)]);
     let banned = v1::UpdateMissionRequest { forbid: vec![pair("a", "x")], ..Default::default() };
-    let (told, next) = one(banned);
+    let (changed, next) = one(banned);
     // As many agents as possible have a goal: they exchange theirs.
-    assert_eq!(told, [("a".to_owned(), ChangeReason::PairForbidden), ("b".to_owned(), ChangeReason::Switched)]);
+    assert_eq!(changed, [("a".to_owned(), ChangeReason::PairForbidden), ("b".to_owned(), ChangeReason::Switched)]);
     let again = change(&next, v1::UpdateMissionRequest { allow: vec![pair("a", "x")], ..Default::default() });
     assert_eq!(goals(&again), [("a", "x"), ("b", "y")]);
 }
@@ -145,25 +145,25 @@ fn wrong_fields_are_named() {
         let error = Mission::create(message, "me", "d", 0, &LIMITS, &planner).unwrap_err().to_string();
         assert!(error.starts_with(words), "{error} instead of {words}");
     };
-    created(|m| m.mission_id = "a b".into(), "mission_id: a name");
-    created(|m| m.mission_id = "training.x".into(), "mission_id: a name");
+    created(|m| m.mission_id = "a b".into(), "mission_id: use 1 to 128");
+    created(|m| m.mission_id = "training.x".into(), "mission_id: use 1 to 128");
     created(|m| m.title = "x".repeat(300), "title: 300 bytes");
-    created(|m| m.agents[1].id = "a".into(), "agents[1].id: the same name");
+    created(|m| m.agents[1].id = "a".into(), "agents[1].id: duplicate name");
     created(|m| m.agents[1].id.clear(), "agents[1].id: 0 bytes");
     created(|m| m.agents[1].position.clear(), "agents[1].position: 0 coordinates");
-    created(|m| m.goals[0].position = vec![0.0; 3], "goals[0].position: 3 coordinates, others have 2");
+    created(|m| m.goals[0].position = vec![0.0; 3], "goals[0].position: 3 coordinates, but other members have 2");
     created(|m| m.goals[0].position[1] = f32::NAN, "goals[0].position[1]: NaN");
     created(|m| m.goals[0].state = 9, "goals[0].state: 9");
-    created(|m| m.scheduler = v1::SchedulerKind::Random.into(), "scheduler: a mission cannot be random");
+    created(|m| m.scheduler = v1::AssignmentMethod::Random.into(), "scheduler: random is not allowed");
     created(|m| m.switching_cost = f64::INFINITY, "switching_cost: inf");
     created(|m| m.lifetime_seconds = Some(61.0), "lifetime_seconds: 61");
     created(|m| m.forbidden = vec![pair("a", "z")], "forbidden[0].goal_id: no member");
-    created(|m| m.forbidden = vec![v1::PairRef::default()], "forbidden[0].agent_id: missing; missions name");
+    created(|m| m.forbidden = vec![v1::PairRef::default()], "forbidden[0].agent_id: missing; pairs of a mission");
     created(
         |m| m.agents = (0..21).map(|k| member(&k.to_string(), &[0.0, 0.0])).collect(),
         "agents[20].id: a mission has at most 20",
     );
-    created(|m| m.forbidden = vec![pair("a", "z"); 201], "forbidden: 201 entries are more than 200");
+    created(|m| m.forbidden = vec![pair("a", "z"); 201], "forbidden: 201 entries exceed the limit of 200");
     let mission = start(0.0);
     let updated = |request: v1::UpdateMissionRequest, words: &str| {
         let error = mission.update(request, 0, &LIMITS, &planner).unwrap_err().to_string();
@@ -174,7 +174,7 @@ fn wrong_fields_are_named() {
     let wrong = v1::UpdateMissionRequest { remove_agents: vec!["a".into(), "a".into()], ..Default::default() };
     updated(wrong, "remove_agents[1]: no member");
     let wrong = v1::UpdateMissionRequest { allow: vec![pair("a", "z"); 201], ..Default::default() };
-    updated(wrong, "allow: 201 entries are more than 200");
+    updated(wrong, "allow: 201 entries exceed the limit of 200");
     let wrong = v1::UpdateMissionRequest { agents: vec![state("new", MemberState::Active)], ..Default::default() };
     updated(wrong, "agents[0].position: 0 coordinates");
 }
@@ -190,9 +190,13 @@ fn missions_are_bounded_in_number_and_age() {
     make("1", "me", 0).unwrap();
     assert!(matches!(make("1", "me", 0), Err(KeepError::Exists(_))));
     make("2", "me", 1000).unwrap();
-    assert!(matches!(make("3", "me", 0), Err(KeepError::Full(text)) if text.contains("a client has at most 2")));
+    assert!(
+        matches!(make("3", "me", 0), Err(KeepError::Full(text)) if text.contains("the client is at its limit of 2"))
+    );
     make("3", "you", 0).unwrap();
-    assert!(matches!(make("4", "them", 0), Err(KeepError::Full(text)) if text.contains("keeps 3")));
+    assert!(
+        matches!(make("4", "them", 0), Err(KeepError::Full(text)) if text.contains("the service is at its limit of 3"))
+    );
     let old: Vec<String> = missions.expire(60_500).unwrap().iter().map(|m| m.id().to_owned()).collect();
     assert_eq!(old, ["1", "3"]);
     assert!(missions.get("1").is_none() && missions.get("2").is_some());
@@ -209,12 +213,12 @@ fn a_mission_that_is_no_longer_the_one_that_was_looked_at_stays() {
     let missions = Missions::open(None, Bounds::default()).unwrap();
     let make = |owner: &str| Mission::create(request(0.0), owner, "", 1000, &LIMITS, &planner).unwrap();
     let mine = missions.insert(make("me")).unwrap();
-    // Between my look and my change somebody else takes the name, at the same revision, in the same millisecond.
+    // Between read and write another client takes the name, at the same revision, in the same millisecond.
     let next = change(&mine, v1::UpdateMissionRequest::default());
     missions.remove("m", |_| true).unwrap();
     let theirs = missions.insert(make("them")).unwrap();
     let mine = |mission: &Mission| mission.assignment.owner == "me";
-    let absent = missions.remove("nobody's", mine).unwrap_err().to_string().replace("nobody's", "m");
+    let absent = missions.remove("missing", mine).unwrap_err().to_string().replace("missing", "m");
     assert_eq!(missions.remove("m", mine).unwrap_err().to_string(), absent);
     assert_eq!(missions.replace(next, 1).unwrap_err().to_string(), absent);
     assert_eq!(missions.get("m").unwrap(), theirs);

@@ -4,13 +4,13 @@
 
 use magex_dispatch::engine::{self, Plan};
 use magex_dispatch::{DispatchError, Limits, Problem, UNASSIGNED, answer};
-use magex_proto::goals::SchedulerKind;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::{arrays, v1};
 use proptest::prelude::*;
 use proptest::strategy::Union;
 
-const KINDS: [SchedulerKind; 4] =
-    [SchedulerKind::Exact, SchedulerKind::Makespan, SchedulerKind::Greedy, SchedulerKind::Random];
+const KINDS: [AssignmentMethod; 4] =
+    [AssignmentMethod::Exact, AssignmentMethod::Makespan, AssignmentMethod::Greedy, AssignmentMethod::Random];
 
 fn limits() -> Limits {
     Limits { members: 12, teams: 3 }
@@ -28,7 +28,7 @@ fn read(message: v1::AssignRequest) -> Problem {
     Problem::read(message, 1, &limits()).unwrap()
 }
 
-fn solve(problem: &Problem, kind: SchedulerKind) -> Plan {
+fn solve(problem: &Problem, kind: AssignmentMethod) -> Plan {
     engine::solve(problem, kind, &|| true).unwrap()
 }
 
@@ -53,21 +53,21 @@ fn a_matrix_alone_makes_a_team_and_single_costs_and_bans_change_it() {
         costs: Some(costs),
         agent_ids: ids("a"),
         goal_ids: ids("g"),
-        scheduler: v1::SchedulerKind::Exact.into(),
+        scheduler: v1::AssignmentMethod::Exact.into(),
         ..Default::default()
     };
     let ask = |message: &v1::AssignRequest, kind| {
         let problem = read(message.clone());
         answer::write(&problem, &solve(&problem, kind))
     };
-    let response = ask(&plain, SchedulerKind::Exact);
+    let response = ask(&plain, AssignmentMethod::Exact);
     assert_eq!((response.cost, response.largest_cost, response.gap), (3.0, 2.0, Some(0.0)));
     assert_eq!((response.pairs[0].goal_id.as_str(), response.pairs[0].distance), ("g0", 0.0));
 
     let named = v1::PairRef { agent_id: "a0".into(), goal_id: "g1".into(), ..Default::default() };
     let cheap =
         v1::AssignRequest { cost_overrides: vec![v1::PairCost { pair: Some(named), cost: -2.0 }], ..plain.clone() };
-    assert_eq!(ask(&cheap, SchedulerKind::Exact).cost, -0.5);
+    assert_eq!(ask(&cheap, AssignmentMethod::Exact).cost, -0.5);
 
     let banned = v1::AssignRequest { forbidden: vec![by_index(0, 0), by_index(0, 1)], ..plain.clone() };
     for kind in KINDS {
@@ -88,7 +88,7 @@ fn who_is_left_over_is_told_why() {
         assert_eq!(response.agents_without_goal[0].reason(), v1::UnassignedReason::Outnumbered);
         assert!(response.goals_without_agent.is_empty());
     }
-    let response = answer::write(&problem, &solve(&problem, SchedulerKind::Exact));
+    let response = answer::write(&problem, &solve(&problem, AssignmentMethod::Exact));
     assert_eq!(response.unassigned_agents, [1]);
 }
 
@@ -97,8 +97,8 @@ fn makespan_minimises_the_longest_way() {
     // The cheapest sum sends one agent far: 0 + 10; the shortest longest way is 6 + 6.
     let costs = v1::CostMatrix { agents: 2, goals: 2, values: vec![0.0, 6.0, 6.0, 10.0] };
     let problem = read(v1::AssignRequest { costs: Some(costs), ..Default::default() });
-    assert_eq!(solve(&problem, SchedulerKind::Exact).goal_of, [0, 1]);
-    let plan = solve(&problem, SchedulerKind::Makespan);
+    assert_eq!(solve(&problem, AssignmentMethod::Exact).goal_of, [0, 1]);
+    let plan = solve(&problem, AssignmentMethod::Makespan);
     assert_eq!((plan.goal_of, plan.cost, plan.exact_cost), (vec![1, 0], 12.0, Some(10.0)));
 }
 
@@ -116,14 +116,14 @@ fn wrong_fields_are_named() {
     check(|m| m.goals = positions(2, &[1.0]), "goals.coordinates: 1 numbers");
     check(|m| m.goals = positions(4, &[1.0; 4]), "goals.dims: 4");
     check(|m| m.goals = positions(3, &[1.0; 3]), "goals: 3 dimensions, the agents have 2");
-    check(|m| m.goals = positions(2, &[0.0; 26]), "goals: 13 points are more than 12");
+    check(|m| m.goals = positions(2, &[0.0; 26]), "goals: 13 points exceed the limit of 12");
     check(|m| m.agents = positions(2, &[1.0, f32::NAN]), "agents.coordinates[1]: NaN");
     check(|m| m.agents = positions(2, &[f32::INFINITY, 0.0]), "agents.coordinates[0]: inf");
     check(|m| m.agent_ids = vec!["a".into()], "agent_ids: 1 names for 2");
     check(|m| m.agent_ids = vec!["a".into(), "a".into()], "agent_ids[1]: the same name as agent_ids[0]");
     check(|m| m.goal_ids = vec![String::new()], "goal_ids[0]: 0 bytes");
-    check(|m| m.scheduler = 99, "scheduler: 99 is unknown");
-    check(|m| m.mode = -1, "mode: -1 is unknown");
+    check(|m| m.scheduler = 99, "scheduler: 99 is not a method");
+    check(|m| m.mode = -1, "mode: -1 is not a mode");
     check(|m| m.switching_cost = f64::NAN, "switching_cost: NaN");
     check(|m| m.switching_cost = -1.0, "switching_cost: -1");
     check(|m| m.deadline_seconds = Some(0.0), "deadline_seconds: 0");
@@ -145,7 +145,7 @@ fn wrong_fields_are_named() {
         let error = error.unwrap_err().to_string();
         assert!(error.starts_with(words), "{error} instead of {words}");
     };
-    check(matrix(2, 1, &[1.0, 1.0]), "costs.agents: 2, there are 1");
+    check(matrix(2, 1, &[1.0, 1.0]), "costs.agents: 2, but there are 1");
     check(matrix(0, 1, &[]), "costs.agents: 0");
     check(matrix(1, u32::MAX, &[]), "costs.goals: 4294967295");
     check(matrix(1, 1, &[]), "costs.values: 0 numbers");
@@ -165,23 +165,23 @@ fn a_model_that_gives_nonsense_is_found_out() {
     assert!(adopt(&[Some(1), Some(0)], None).unwrap_err().contains("forbidden pair"));
     assert!(adopt(&[Some(0), Some(1)], Some(vec![0.5, f32::NAN])).unwrap_err().contains("probability"));
     let plan = adopt(&[Some(0), Some(1)], Some(vec![0.5, 1.0])).unwrap();
-    assert_eq!((plan.scheduler, plan.exact_cost.is_some()), (SchedulerKind::Learned, true));
+    assert_eq!((plan.scheduler, plan.exact_cost.is_some()), (AssignmentMethod::Learned, true));
 }
 
 #[test]
 fn nobody_waits_for_an_answer_that_nobody_wants() {
     let coordinates: Vec<f32> = (0..24).map(|k| ((k * 37) % 23) as f32).collect();
     let problem = read(team(&coordinates, &coordinates[2..]));
-    let stopped = engine::solve(&problem, SchedulerKind::Makespan, &|| false);
+    let stopped = engine::solve(&problem, AssignmentMethod::Makespan, &|| false);
     assert_eq!(stopped, Err(DispatchError::Interrupted));
     // An answer that is there stays, without its distance to the best.
     let values = (0..144).map(|k| f64::from((k / 12 + 1) * (k % 12 + 1))).collect();
     let costs = Some(v1::CostMatrix { agents: 12, goals: 12, values });
     let problem = read(v1::AssignRequest { costs, ..Default::default() });
-    let greedy = engine::solve(&problem, SchedulerKind::Greedy, &|| false).unwrap();
+    let greedy = engine::solve(&problem, AssignmentMethod::Greedy, &|| false).unwrap();
     assert_eq!(greedy.exact_cost, None);
-    assert_eq!(greedy.goal_of, solve(&problem, SchedulerKind::Greedy).goal_of);
-    assert!(solve(&problem, SchedulerKind::Greedy).exact_cost.is_some());
+    assert_eq!(greedy.goal_of, solve(&problem, AssignmentMethod::Greedy).goal_of);
+    assert!(solve(&problem, AssignmentMethod::Greedy).exact_cost.is_some());
 }
 
 /// Every way to give each agent one of the goals or none, as goal_of.
@@ -310,8 +310,8 @@ proptest! {
             prop_assert_eq!(response.goals_without_agent.len(), response.unassigned_goals.len());
             prop_assert!(response.gap.is_none_or(|gap| gap >= 0.0));
             match kind {
-                SchedulerKind::Exact => most = response.pairs.len(),
-                SchedulerKind::Greedy => prop_assert!(2 * response.pairs.len() >= most),
+                AssignmentMethod::Exact => most = response.pairs.len(),
+                AssignmentMethod::Greedy => prop_assert!(2 * response.pairs.len() >= most),
                 _ => prop_assert_eq!(response.pairs.len(), most),
             }
             prop_assert_eq!(solve(&problem, kind), plan, "the same again");
@@ -359,7 +359,7 @@ proptest! {
                 best = (pairs, sum);
             }
         });
-        let (pairs, sum) = score(&solve(&problem, SchedulerKind::Exact).goal_of);
+        let (pairs, sum) = score(&solve(&problem, AssignmentMethod::Exact).goal_of);
         prop_assert_eq!(pairs, best.0);
         prop_assert!((sum - best.1).abs() < 1e-6, "{} instead of {}", sum, best.1);
     }

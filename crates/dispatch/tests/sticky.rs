@@ -1,11 +1,11 @@
-//! Who has a goal keeps it unless leaving it is worth it, whichever scheduler answers and whatever else there is.
+//! An agent keeps its goal unless leaving it saves more than the switching cost, whatever the method.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_dispatch::engine::{self, Plan};
 use magex_dispatch::mission::{Mission, MissionLimits, Planned};
 use magex_dispatch::{DispatchError, Limits, Problem, UNASSIGNED, answer};
-use magex_proto::goals::SchedulerKind;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use magex_proto::v1::ChangeReason;
 use proptest::prelude::*;
@@ -25,7 +25,7 @@ fn matrix(agents: usize, values: &[f64], current: &[(u32, u32)], switching_cost:
 }
 
 fn exact(problem: &Problem) -> Vec<u32> {
-    engine::solve(problem, SchedulerKind::Exact, &|| true).unwrap().goal_of
+    engine::solve(problem, AssignmentMethod::Exact, &|| true).unwrap().goal_of
 }
 
 fn adopt(problem: &Problem, wish: &[u32]) -> Plan {
@@ -78,7 +78,7 @@ fn who_joins_a_learned_mission_sends_nobody_elsewhere() {
         mission_id: "m".into(),
         agents: vec![member("a", 0.0), member("b", 1.0)],
         goals: vec![member("x", 0.0), member("y", 1.0)],
-        scheduler: v1::SchedulerKind::Learned.into(),
+        scheduler: v1::AssignmentMethod::Learned.into(),
         switching_cost: 5.0,
         ..Default::default()
     };
@@ -99,7 +99,7 @@ fn who_joins_a_learned_mission_sends_nobody_elsewhere() {
     let [change] = &joined.assignment.changes[..] else { panic!("{:?}", joined.assignment.changes) };
     assert_eq!((change.agent_id.as_str(), change.to_goal_id.as_str()), ("c", "z"));
     assert_eq!(change.reason(), ChangeReason::Assigned);
-    // A fourth without a goal of its own displaces nobody.
+    // A fourth agent without a goal displaces no other.
     let fourth = v1::UpdateMissionRequest { agents: vec![member("0", 1.0)], ..Default::default() };
     let crowded = joined.update(fourth, 2, &LIMITS, &restless).unwrap();
     assert!(crowded.assignment.changes.is_empty(), "{:?}", crowded.assignment.changes);
@@ -128,7 +128,7 @@ fn of_two_exchanges_that_a_model_wants_the_one_that_is_worth_it_happens() {
     let problem = matrix(5, &costs, &current, 1.0);
     let plan = adopt(&problem, &[1, 0, 3, 2, 4]);
     assert_eq!(plan.goal_of, [0, 1, 3, 2, 4]);
-    assert_eq!((plan.cost, plan.scheduler), (6.0, SchedulerKind::Learned));
+    assert_eq!((plan.cost, plan.scheduler), (6.0, AssignmentMethod::Learned));
     // What the model did not choose has no probability of its.
     assert_eq!(plan.probabilities, Some(vec![None, None, Some(0.5), Some(0.5), Some(0.5)]));
     let response = answer::write(&problem, &plan);

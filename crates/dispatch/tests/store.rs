@@ -1,5 +1,4 @@
-//! What missions take, and the disk below them: nobody takes everything, and a disk that fails takes nothing that was
-//! acknowledged, and works again as soon as it can.
+//! Limits of missions in bytes, and their file: a failed write loses no acknowledged mission, and writing resumes once possible.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "helpers of tests")]
 
@@ -83,7 +82,7 @@ fn what_changed_last_counts() {
     assert!(full(missions.replace(next, 2)).contains("one client"));
 }
 
-/// A disk in memory that takes so many writes, and then none until there is room.
+/// A disk in memory that accepts a number of writes and then fails until there is room.
 #[derive(Debug, Default)]
 struct Small {
     bytes: Mutex<Vec<u8>>,
@@ -131,7 +130,7 @@ impl StorageBackend for Backend {
     }
 
     fn sync_data(&self) -> io::Result<()> {
-        // What was written is there all the same: nobody knows whether a commit that failed here happened.
+        // The data is written all the same: whether a commit that failed here happened is unknown.
         self.0.take()
     }
 
@@ -206,7 +205,7 @@ fn a_disk_that_failed_is_not_tried_with_every_call() {
     let Err(KeepError::Disk(DiskError::Database(_))) = missions.insert(make("1", "me")) else { panic!("no failure") };
     disk.room(i64::MAX);
     let Err(resting) = missions.insert(make("1", "me")) else { panic!("tried at once") };
-    assert!(matches!(resting, KeepError::Disk(DiskError::Resting)) && resting.to_string().contains("make room"));
+    assert!(matches!(resting, KeepError::Disk(DiskError::Paused)) && resting.to_string().contains("free space"));
 }
 
 #[test]
@@ -286,4 +285,19 @@ fn a_real_disk_that_was_full_is_used_again() {
     missions.close();
     let on_disk = Disk::open(&path).unwrap().load().unwrap();
     assert_eq!(on_disk.into_iter().map(|m| (m.id().to_owned(), m)).collect::<BTreeMap<_, _>>(), after);
+}
+
+#[test]
+fn a_file_of_an_older_format_is_rejected_with_the_version_that_reads_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("missions.redb");
+    {
+        let about = redb::TableDefinition::<&str, u64>::new("about");
+        let write = Database::create(&path).unwrap().begin_write().unwrap();
+        write.open_table(about).unwrap().insert("format", 1).unwrap();
+        write.commit().unwrap();
+    }
+    let error = Disk::open(&path).unwrap_err().to_string();
+    assert!(error.starts_with("written by magex 0.1.0 (commit 389f705), which reads it; this is magex "), "{error}");
+    assert!(error.ends_with("--data folder"), "{error}");
 }

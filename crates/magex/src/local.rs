@@ -1,7 +1,7 @@
 //! Everything in one process: the same rollouts, the same goals, the same bits as the cluster, without a network.
 
 use magex_actor::rollout::Roller;
-use magex_commander::learned::answer;
+use magex_commander::shard_goals::answer;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;

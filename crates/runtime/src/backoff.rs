@@ -1,4 +1,4 @@
-//! Waiting longer and longer between attempts, out of step with everybody else.
+//! Exponential backoff with jitter.
 
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::time::Duration;
@@ -35,12 +35,12 @@ impl Backoff {
     }
 }
 
-/// A number in 0..1 that nobody can rely on.
+/// An unpredictable number in 0..1.
 fn fraction() -> f64 {
     f64::from(RandomState::new().build_hasher().finish() as u32) / (f64::from(u32::MAX) + 1.0)
 }
 
-/// A number that no other process is likely to draw: names an random_id, never a number of a run.
+/// A random identifier that no other process is likely to draw. It never becomes a number of a run.
 pub fn random_id() -> u64 {
     let mut hasher = RandomState::new().build_hasher();
     hasher.write_u32(std::process::id());

@@ -1,4 +1,4 @@
-//! Connecting to a service, and showing it who we are.
+//! Clients of services: channels with TLS and credentials.
 
 use crate::tls::ClientTls;
 use std::path::Path;
@@ -9,34 +9,32 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{self, Endpoint};
 use tonic::{Request, Status};
 
-/// A connection whose calls carry the caller's token, if it has one.
+/// A channel whose calls carry the client's token, if it has one.
 pub type Channel = InterceptedService<transport::Channel, Bearer>;
 
-/// A url that is not connected to, whatever runs there.
+/// A URL that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum UrlError {
-    /// It makes no sense.
+    /// It is malformed.
     #[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
     Form {
-        /// The url.
+        /// The URL.
         url: String,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
-    /// Whoever listens on the way would learn the token.
-    #[error(
-        "'{0}': the token would travel unencrypted to another machine; use https, or --insecure to send it all the same"
-    )]
+    /// The token would be sent without TLS.
+    #[error("'{0}': the token would be sent unencrypted to another machine; use https, or --insecure to allow it")]
     Exposed(String),
 }
 
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectError {
-    /// There cannot be one.
+    /// The URL cannot be used.
     #[error(transparent)]
     Url(#[from] UrlError),
-    /// Nobody answers there.
+    /// The connection failed.
     #[error(transparent)]
     Transport(#[from] transport::Error),
 }
@@ -45,27 +43,27 @@ pub enum ConnectError {
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(MetadataValue<Ascii>);
 
-/// A token that cannot be used. Does not contain it.
+/// Why a token is unusable. The message does not contain it.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenError {
-    /// Its file.
+    /// Its file cannot be read.
     #[error("the token's file {path}: {source}")]
     File {
         /// Its name.
         path: String,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
-    /// What is in there.
+    /// Its form.
     #[error("{0}: a token is one line of printable ASCII")]
     Form(String),
 }
 
 impl Token {
-    /// A token from where `source` says; space around it does not count.
+    /// A token, without surrounding whitespace; `source` names its origin in errors.
     ///
     /// # Errors
-    /// It cannot be sent.
+    /// It contains characters that a header cannot carry.
     pub fn new(text: &str, source: &str) -> Result<Self, TokenError> {
         let (text, wrong) = (text.trim(), || TokenError::Form(source.to_owned()));
         if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
@@ -76,10 +74,10 @@ impl Token {
         Ok(Self(value))
     }
 
-    /// The token in a file.
+    /// Reads a token from a file.
     ///
     /// # Errors
-    /// The file cannot be read, or there is no token in it.
+    /// The file cannot be read, or holds no token.
     pub fn read(path: &Path) -> Result<Self, TokenError> {
         let name = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|source| TokenError::File { path: name.clone(), source })?;
@@ -94,31 +92,31 @@ impl std::fmt::Debug for Token {
     }
 }
 
-/// How a program shows who it is, and whom it trusts. Read once: it serves every connection.
+/// The credentials of a client and the CA that it trusts; read once for all connections.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Settings {
     /// For https.
     pub tls: Option<ClientTls>,
     /// Sent with every call.
     pub token: Option<Token>,
-    /// The token may travel unencrypted.
+    /// The token may be sent without TLS.
     pub insecure: bool,
 }
 
 impl Settings {
-    /// A channel that connects with the first call and again whenever it is broken.
+    /// A channel that connects with the first call and reconnects after failures.
     ///
     /// # Errors
-    /// The url makes no sense, or the token would be seen.
+    /// The URL is malformed, or the token would be sent without TLS.
     pub fn lazy_channel(&self, url: &str) -> Result<Channel, UrlError> {
         let (endpoint, bearer) = self.endpoint(url)?;
         Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
     }
 
-    /// A channel that is connected.
+    /// A connected channel.
     ///
     /// # Errors
-    /// The url makes no sense, the token would be seen, or nobody answers.
+    /// The URL is malformed, the token would be sent without TLS, or the connection failed.
     pub async fn connect(&self, url: &str) -> Result<Channel, ConnectError> {
         let (endpoint, bearer) = self.endpoint(url)?;
         Ok(InterceptedService::new(endpoint.connect().await?, bearer))
@@ -134,7 +132,7 @@ impl Settings {
     }
 }
 
-/// A host that is this machine. A name is believed only if it can be no other's.
+/// Whether a host is this machine: a loopback address, or `localhost`.
 fn is_local(host: Option<&str>) -> bool {
     let host = host.unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
     host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|address| address.is_loopback())
@@ -156,15 +154,15 @@ impl Interceptor for Bearer {
 /// An endpoint with our settings, without certificates.
 ///
 /// # Errors
-/// The url makes no sense.
+/// The URL is malformed.
 pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
     endpoint_with(url, None)
 }
 
-/// An endpoint whose certificates, for an https url, are those that the environment names.
+/// An endpoint that takes the certificates for an https URL from the environment.
 ///
 /// # Errors
-/// The url makes no sense, or the certificates cannot be read.
+/// The URL is malformed, or the certificates cannot be read.
 pub fn endpoint_from_env(url: &str) -> Result<Endpoint, UrlError> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
     let tls = secure.then(ClientTls::from_env).transpose();
@@ -172,11 +170,11 @@ pub fn endpoint_from_env(url: &str) -> Result<Endpoint, UrlError> {
     endpoint_with(url, tls.as_ref())
 }
 
-/// An endpoint with our settings: a peer that is gone is noticed within 15 s even when nothing is being said. The
-/// certificates count for https only.
+/// An endpoint with our settings: a dead peer is detected within 15 s, even on an idle connection. Certificates apply to https
+/// only.
 ///
 /// # Errors
-/// The url makes no sense.
+/// The URL is malformed.
 pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
     let wrong = |reason: String| UrlError::Form { url: url.to_owned(), reason };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;
@@ -185,7 +183,7 @@ pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, Url
         (Some("http"), _) => endpoint,
         (Some("https"), Some(tls)) => endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?,
         (Some("https"), None) => {
-            let problem = "name the authority that signed its certificate: MAGEX_TLS_CA or --tls-ca";
+            let problem = "name the CA of its certificate: MAGEX_TLS_CA or --tls-ca";
             return Err(wrong(problem.to_owned()));
         }
         _ => return Err(wrong("not an http url".to_owned())),
@@ -205,7 +203,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_url_without_scheme_is_refused_with_the_form() {
+    fn a_malformed_url_is_rejected_with_the_expected_form() {
         for url in ["", "localhost:7000", "127.0.0.1:7000", "ftp://x:1", "http://", "https://x:1"] {
             let error = endpoint(url).unwrap_err().to_string();
             assert!(error.contains("http://host:port"), "{error}");
@@ -214,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_travels_encrypted_or_stays_on_the_machine() {
+    fn a_token_is_sent_only_over_tls_or_to_this_machine() {
         let settings = Settings { token: Some(Token::new(" s3cret\n", "here").unwrap()), ..Settings::default() };
         for url in ["http://localhost:1", "http://127.0.0.1:1", "http://127.9.9.9:1", "http://[::1]:1"] {
             settings.endpoint(url).unwrap();
@@ -228,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_sent_and_never_shown() {
+    fn a_token_is_sent_but_never_logged() {
         let token = Token::new(" s3cret\n", "here").unwrap();
         let request = Bearer(Some(token.clone())).call(Request::new(())).unwrap();
         assert_eq!(request.metadata().get("authorization").unwrap(), "Bearer s3cret");

@@ -1,16 +1,16 @@
-//! Exit codes, as in sysexits.h, and the end of a command.
+//! Exit codes, as in sysexits.h, and the outcome of a command.
 
 use std::process::ExitCode;
 
-/// Everything went well.
+/// Success.
 pub const OK: u8 = 0;
 /// The work failed.
 pub const FAILURE: u8 = 1;
 /// Wrong usage or configuration: nothing was started.
 pub const USAGE: u8 = 64;
-/// A service that is needed cannot be used.
+/// A required service is unavailable.
 pub const UNAVAILABLE: u8 = 69;
-/// A fault of ours.
+/// An internal error.
 pub const INTERNAL: u8 = 70;
 /// An output cannot be created.
 pub const CANNOT_CREATE: u8 = 73;
@@ -19,13 +19,13 @@ pub const TEMPORARY: u8 = 75;
 /// Interrupted twice.
 pub const INTERRUPTED: u8 = 130;
 
-/// Why a command failed, and the exit code that says so.
+/// Why a command failed, and its exit code.
 #[derive(Debug, thiserror::Error)]
 #[error("{message}")]
 pub struct Failure {
     /// Exit code.
     pub code: u8,
-    /// What to tell the user.
+    /// The message for the user.
     pub message: String,
 }
 
@@ -41,7 +41,7 @@ impl Failure {
     }
 }
 
-/// Runs a command's body with the arguments of this process: usage errors exit with [`USAGE`], failures are told on
+/// Runs a command's body with the arguments of this process: usage errors exit with [`USAGE`], failures are printed to
 /// standard error and exit with their code.
 pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> ExitCode {
     let arguments = match P::try_parse() {
@@ -55,8 +55,8 @@ pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> Exit
     report(body(arguments))
 }
 
-/// The exit code of a result; a failure is told on standard error.
-#[allow(clippy::print_stderr, reason = "the one place that tells why a command failed")]
+/// The exit code of a result; a failure is printed to standard error.
+#[allow(clippy::print_stderr, reason = "the one place that prints why a command failed")]
 pub fn report(result: Result<u8, Failure>) -> ExitCode {
     match result {
         Ok(code) => ExitCode::from(code),

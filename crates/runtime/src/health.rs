@@ -1,5 +1,4 @@
-//! Health that tells the truth: not serving until the service says so, and not serving while it drains. [`probe`] asks for
-//! it.
+//! Health of a service: NOT_SERVING until the service is ready, and again while it drains. [`probe`] is the client.
 
 pub mod probe;
 
@@ -16,7 +15,7 @@ pub struct Health {
 }
 
 impl Health {
-    /// Starts not serving. The second value is the gRPC service to add to a router.
+    /// Starts as NOT_SERVING. The second value is the gRPC service to add to a router.
     pub async fn new<S: NamedService>() -> (Self, HealthServer<impl HealthApi>) {
         let (reporter, server) = health_reporter();
         let health = Self { reporter, name: S::NAME };
@@ -24,7 +23,7 @@ impl Health {
         (health, server)
     }
 
-    /// Ready for requests, or not.
+    /// Sets SERVING or NOT_SERVING.
     pub async fn set(&self, serving: bool) {
         let status = if serving { ServingStatus::Serving } else { ServingStatus::NotServing };
         self.reporter.set_service_status("", status).await;

@@ -1,9 +1,9 @@
-//! What a service shows to operators over plain HTTP, on an address of its own: metrics, and whatever pages it has.
+//! The operators' HTTP server of a service, on its own address: metrics, and the pages that the service adds.
 //!
-//! Read-only. It listens on loopback unless told otherwise; nothing of it is needed for training.
+//! Read-only and optional: training does not depend on it.
 
-use crate::connections::{ConnectionLimits, Incoming};
 use crate::metrics::Metrics;
+use crate::net::connections::{ConnectionLimits, Incoming};
 use crate::server::{self, BindError, GRACE};
 pub use axum::Router;
 use axum::extract::connect_info::Connected;
@@ -20,11 +20,11 @@ use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-/// Operators and their tools are few; sockets that ask for nothing are closed.
+/// Operators and their tools are few; idle sockets are closed.
 const CONNECTIONS: ConnectionLimits =
     ConnectionLimits { total: 256, per_peer: 256, first_call: Duration::from_secs(10) };
 
-/// The option of every service that has something to show.
+/// The option of every service with an HTTP server.
 #[derive(Debug, Clone, Default, clap::Args, serde::Serialize)]
 pub struct HttpArgs {
     /// Address for operators: /metrics for Prometheus, and a learner's live page at /, over plain HTTP; port 0 is any free one [default: none]
@@ -34,10 +34,10 @@ pub struct HttpArgs {
 }
 
 impl HttpArgs {
-    /// Listens, if there is an address to listen on. Must be called within a runtime.
+    /// Listens, if an address is given. Must be called within a runtime.
     ///
     /// # Errors
-    /// The address makes no sense or is taken.
+    /// The address is malformed or in use.
     pub async fn bind(&self) -> Result<Option<Page>, BindError> {
         match &self.http {
             Some(listen) => bind(listen).await.map(Some),
@@ -46,7 +46,7 @@ impl HttpArgs {
     }
 }
 
-/// A socket that is listened on, and nobody answers yet.
+/// A bound HTTP server that does not serve yet.
 #[derive(Debug)]
 pub struct Page {
     incoming: Incoming,
@@ -54,17 +54,17 @@ pub struct Page {
 }
 
 impl Page {
-    /// Where it is.
+    /// The address it listens on.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Answers in the background until `shutdown`, and at most [`GRACE`] longer. What goes wrong is only logged: training
-    /// does not depend on who watches it.
+    /// Serves in the background until `shutdown`, and at most [`GRACE`] longer. Errors are only logged: training does not
+    /// depend on this server.
     pub fn serve(self, routes: Router, shutdown: CancellationToken) -> JoinHandle<()> {
         tokio::spawn(async move {
             if let Err(error) = serve(self.incoming, routes, shutdown).await {
-                tracing::error!(%error, "metrics are served no more");
+                tracing::error!(%error, "the HTTP server failed; metrics are no longer served");
             }
         })
     }
@@ -73,13 +73,13 @@ impl Page {
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
 ///
 /// # Errors
-/// The address makes no sense or is taken.
+/// The address is malformed or in use.
 pub async fn bind(listen: &str) -> Result<Page, BindError> {
     let (listener, address) = server::listener(listen, "--http").await?;
     Ok(Page { incoming: Incoming::new(listener, CONNECTIONS), address })
 }
 
-/// `/metrics` in the text format of Prometheus, and `/healthz`, which only says that the process answers.
+/// `/metrics` in the text format of Prometheus, and `/healthz`, which answers as long as the process is alive.
 pub fn routes(metrics: Arc<Metrics>) -> Router {
     let scrape = move || {
         let text = metrics.text();
@@ -88,7 +88,7 @@ pub fn routes(metrics: Arc<Metrics>) -> Router {
     Router::new().route("/metrics", get(scrape)).route("/healthz", get(async || "ok\n"))
 }
 
-/// Whose connection a request came in on.
+/// The peer of a request's connection.
 #[derive(Debug, Clone, Copy)]
 struct Peer(SocketAddr);
 
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn sockets_that_ask_for_nothing_make_way() {
+    async fn idle_sockets_are_evicted() {
         let page = bind("127.0.0.1:0").await.unwrap();
         let address = page.address();
         let connections = page.incoming.connections();
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn without_an_address_nothing_is_opened_and_a_wrong_one_is_named() {
+    async fn without_an_address_nothing_is_opened_and_a_malformed_one_is_named() {
         assert!(HttpArgs::default().bind().await.unwrap().is_none());
         let page = bind("127.0.0.1:0").await.unwrap();
         let taken = page.address().to_string();

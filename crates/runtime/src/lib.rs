@@ -1,20 +1,17 @@
-//! What every service needs and no domain type: logs, traces, metrics, shutdown, sockets, TLS, callers, servers, clients, health, retries.
+//! What every service shares and no domain type: the path of a call ([`net`]), servers, clients, TLS, health and retries; logs,
+//! traces and metrics; the start and the end of a process ([`service`]).
 
-pub mod access;
-pub mod admission;
 pub mod backoff;
-pub mod calls;
 pub mod client;
-pub mod connections;
-pub mod deadline;
-pub mod door;
 pub mod exit;
 pub mod health;
 pub mod http;
 pub mod metrics;
+pub mod net;
 pub mod process;
 pub mod security;
 pub mod server;
+pub mod service;
 pub mod shutdown;
 pub mod status;
 pub mod sync;

@@ -1,27 +1,31 @@
-//! The metrics of a process, in the format of Prometheus.
+//! The metrics of a process, in the text format of Prometheus.
 //!
-//! Each service declares its own in one place, by the methods of [`Metrics`]; docs/metrics.md lists them all, and a test
-//! compares that list with a scrape. Metrics are written and never read back: no number of a run depends on one.
+//! Each service declares its metrics in one place, with the methods of [`Metrics`]; docs/metrics.md lists all of them, and a
+//! test compares that list with a scrape. Metrics are write-only: no number of a run depends on one.
 
-mod kinds;
+mod process;
 
-pub use kinds::{Counter, Counters, Gauge, Gauges, Held, Seconds, SecondsBy};
+pub use prometheus::{Gauge, GaugeVec, Histogram, HistogramVec, IntCounter, IntCounterVec};
+
 use prometheus::core::Collector;
-use prometheus::process_collector::ProcessCollector;
-use prometheus::{GaugeVec, HistogramOpts, HistogramVec, IntCounterVec, Opts, Registry, TextEncoder};
+use prometheus::{HistogramOpts, Opts, Registry, TextEncoder};
 use std::fmt;
 use std::sync::{Mutex, PoisonError};
 
-/// Bounds of the buckets of every time that is measured, seconds.
+/// Upper bounds of the buckets of every duration histogram, seconds.
 const BUCKETS: [f64; 18] =
     [1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0];
 
-type Look = Box<dyn Fn() + Send + Sync>;
+type Hook = Box<dyn Fn() + Send + Sync>;
 
-/// What a scrape returns. One per service, so that several services in one process do not mix.
+/// The metrics of one service, so that several services in one process do not mix.
+///
+/// # Panics
+/// Declaring a metric panics if its name is taken or invalid. That is a programming error, which the test of the metrics
+/// catalogue finds.
 pub struct Metrics {
     registry: Registry,
-    looks: Mutex<Vec<Look>>,
+    hooks: Mutex<Vec<Hook>>,
 }
 
 impl fmt::Debug for Metrics {
@@ -37,75 +41,88 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// The metrics of the process itself (memory, processor time, open files); more is declared by the service.
+    /// The metrics of the process itself (memory, processor time, open files); the service declares more.
     pub fn new() -> Self {
-        let metrics = Self { registry: Registry::new(), looks: Mutex::default() };
-        metrics.register(ProcessCollector::for_self());
+        let metrics = Self { registry: Registry::new(), hooks: Mutex::default() };
+        process::declare(&metrics);
         metrics
     }
 
-    /// Adds a metric. One whose name is taken or unusable is left out, and said so.
-    pub fn register(&self, collector: impl Collector + 'static) {
-        if let Err(error) = self.registry.register(Box::new(collector)) {
-            tracing::error!(%error, "a metric cannot be registered");
-        }
+    /// Declares a counter.
+    pub fn counter(&self, name: &str, help: &str) -> IntCounter {
+        self.declare(IntCounter::new(name, help))
     }
 
-    /// A number that only grows.
-    pub fn counter(&self, name: &str, help: &str) -> Counter {
-        self.counters(name, help, &[]).with(&[])
+    /// Declares a counter for every combination of labels.
+    pub fn counters(&self, name: &str, help: &str, labels: &[&str]) -> IntCounterVec {
+        self.declare(IntCounterVec::new(Opts::new(name, help), labels))
     }
 
-    /// One such number for every combination of labels.
-    pub fn counters(&self, name: &str, help: &str, labels: &[&str]) -> Counters {
-        Counters(self.declare(IntCounterVec::new(Opts::new(name, help), labels)))
-    }
-
-    /// A number that goes up and down.
+    /// Declares a gauge.
     pub fn gauge(&self, name: &str, help: &str) -> Gauge {
-        self.gauges(name, help, &[]).with(&[])
+        self.declare(Gauge::new(name, help))
     }
 
-    /// One such number for every combination of labels.
-    pub fn gauges(&self, name: &str, help: &str, labels: &[&str]) -> Gauges {
-        Gauges(self.declare(GaugeVec::new(Opts::new(name, help), labels)))
+    /// Declares a gauge for every combination of labels.
+    pub fn gauges(&self, name: &str, help: &str, labels: &[&str]) -> GaugeVec {
+        self.declare(GaugeVec::new(Opts::new(name, help), labels))
     }
 
-    /// A histogram of times.
-    pub fn seconds(&self, name: &str, help: &str) -> Seconds {
-        self.seconds_by(name, help, &[]).with(&[])
+    /// Declares a histogram of durations, in seconds.
+    pub fn seconds(&self, name: &str, help: &str) -> Histogram {
+        self.declare(Histogram::with_opts(HistogramOpts::new(name, help).buckets(BUCKETS.to_vec())))
     }
 
-    /// One such histogram for every combination of labels.
-    pub fn seconds_by(&self, name: &str, help: &str, labels: &[&str]) -> SecondsBy {
-        let options = HistogramOpts::new(name, help).buckets(BUCKETS.to_vec());
-        SecondsBy(self.declare(HistogramVec::new(options, labels)))
+    /// Declares a histogram of durations, in seconds, for every combination of labels.
+    pub fn seconds_by(&self, name: &str, help: &str, labels: &[&str]) -> HistogramVec {
+        self.declare(HistogramVec::new(HistogramOpts::new(name, help).buckets(BUCKETS.to_vec()), labels))
     }
 
-    /// Called before every scrape: sets what is only known by looking (ages, lengths of queues).
-    pub fn before_scrape(&self, look: impl Fn() + Send + Sync + 'static) {
-        self.looks.lock().unwrap_or_else(PoisonError::into_inner).push(Box::new(look));
+    /// Calls `hook` before every scrape, to set gauges that are computed on demand (ages, lengths of queues).
+    pub fn before_scrape(&self, hook: impl Fn() + Send + Sync + 'static) {
+        self.hooks.lock().unwrap_or_else(PoisonError::into_inner).push(Box::new(hook));
     }
 
-    /// Everything, in the text format.
+    /// All metrics, in the text format.
     pub fn text(&self) -> String {
-        for look in self.looks.lock().unwrap_or_else(PoisonError::into_inner).iter() {
-            look();
+        for hook in self.hooks.lock().unwrap_or_else(PoisonError::into_inner).iter() {
+            hook();
         }
         TextEncoder::new().encode_to_string(&self.registry.gather()).unwrap_or_else(|error| format!("# {error}\n"))
     }
 
-    fn declare<T: Collector + Clone + 'static>(&self, made: Result<T, prometheus::Error>) -> Option<T> {
-        match made {
-            Ok(metric) => {
-                self.register(metric.clone());
-                Some(metric)
-            }
-            Err(error) => {
-                tracing::error!(%error, "a metric cannot be declared");
-                None
-            }
-        }
+    #[allow(
+        clippy::expect_used,
+        reason = "a wrong declaration is a programming error, found by the first test that runs"
+    )]
+    fn declare<T: Collector + Clone + 'static>(&self, made: Result<T, prometheus::Error>) -> T {
+        let metric = made.expect("a metric has a valid name and valid labels");
+        self.registry.register(Box::new(metric.clone())).expect("a metric is declared once");
+        metric
+    }
+}
+
+/// Raises a counter to `total`, for a total that is counted elsewhere. A smaller `total` changes nothing. Not atomic: callers
+/// hold a lock.
+pub fn raise_to(counter: &IntCounter, total: u64) {
+    counter.inc_by(total.saturating_sub(counter.get()));
+}
+
+/// Counts one in a gauge until it is dropped.
+#[derive(Debug)]
+pub struct GaugeGuard(Gauge);
+
+impl GaugeGuard {
+    /// Adds one to the gauge.
+    pub fn new(gauge: Gauge) -> Self {
+        gauge.inc();
+        Self(gauge)
+    }
+}
+
+impl Drop for GaugeGuard {
+    fn drop(&mut self) {
+        self.0.dec();
     }
 }
 
@@ -114,19 +131,22 @@ mod tests {
     use super::*;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU32, Ordering};
-    use std::time::Duration;
 
     #[test]
-    fn what_is_declared_is_scraped() {
+    fn declared_metrics_are_scraped() {
         let metrics = Metrics::new();
         let counter = metrics.counter("magex_test_things_total", "Things.");
-        counter.add(2);
-        counter.raise_to(5);
-        counter.raise_to(3);
-        metrics.gauges("magex_test_depth", "Depth.", &["queue"]).with(&["in"]).set(1.5);
-        metrics.seconds("magex_test_wait_seconds", "Wait.").observe(Duration::from_millis(2));
-        let looks = Arc::new(AtomicU32::new(0));
-        let seen = looks.clone();
+        counter.inc_by(2);
+        raise_to(&counter, 5);
+        raise_to(&counter, 3);
+        metrics.gauges("magex_test_depth", "Depth.", &["queue"]).with_label_values(&["in"]).set(1.5);
+        metrics.seconds("magex_test_wait_seconds", "Wait.").observe(2e-3);
+        let held = metrics.gauge("magex_test_held", "Held.");
+        let guards = [GaugeGuard::new(held.clone()), GaugeGuard::new(held.clone())];
+        assert!(held.get() == 2.0);
+        drop(guards);
+        let calls = Arc::new(AtomicU32::new(0));
+        let seen = calls.clone();
         metrics.before_scrape(move || {
             seen.fetch_add(1, Ordering::Relaxed);
         });
@@ -137,20 +157,10 @@ mod tests {
             "magex_test_wait_seconds_bucket{le=\"0.0025\"} 1",
             "magex_test_wait_seconds_count 1",
             "# TYPE magex_test_wait_seconds histogram",
+            "magex_test_held 0",
         ] {
             assert!(text.contains(line), "{line}\n{text}");
         }
-        assert_eq!(looks.load(Ordering::Relaxed), 1);
-    }
-
-    #[test]
-    fn a_metric_that_cannot_be_is_left_out_and_harmless() {
-        let metrics = Metrics::new();
-        metrics.counter("no name", "").add(1);
-        metrics.gauge("magex_test_twice", "Once.").set(1.0);
-        metrics.gauge("magex_test_twice", "Again.").set(2.0);
-        metrics.counters("magex_test_labels_total", "", &["a"]).with(&["x", "y"]).add(1);
-        let text = metrics.text();
-        assert!(text.contains("magex_test_twice 1") && !text.contains("no name"), "{text}");
+        assert_eq!(calls.load(Ordering::Relaxed), 1);
     }
 }

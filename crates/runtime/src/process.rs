@@ -1,28 +1,28 @@
-//! The process itself: its environment and its one line of standard output.
+//! The process itself: its environment, its limits and its one line of standard output.
 
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt as _;
 use std::process::Command;
 
-/// What the C library and the tensor library read of the environment before anything else runs, but for [`ARENAS`].
+/// Variables that the C library and the tensor library read before `main`; see [`ARENAS`] for one more.
 const ENVIRONMENT: [(&str, &str); 4] = [
     // The tensor library must not start threads of its own.
     ("RAYON_NUM_THREADS", "1"),
     ("CANDLE_NUM_THREADS", "1"),
-    // Blocks of up to 32 MiB come from the heap, and the heap keeps up to 64 MiB that are free at its end. It is where glibc's
-    // own rule for these two ends with bigger blocks. With smaller ones, as ours are, each step of training gives its buffers
-    // back to the system and fetches them again: three times slower.
+    // Blocks of up to 32 MiB come from the heap, and the heap keeps up to 64 MiB free at its end: the upper end of glibc's
+    // dynamic thresholds. With the lower thresholds, each training step returns its buffers to the system and maps them
+    // again, which is three times slower.
     ("MALLOC_MMAP_THRESHOLD_", "33554432"),
     ("MALLOC_TRIM_THRESHOLD_", "67108864"),
 ];
 
-/// Heaps among which glibc's allocator spreads the threads. It takes eight for each processor, and each keeps what its
-/// busiest moment needed: with one for each, a learner of 200 actors holds a third less and is no slower.
+/// Number of glibc arenas. The default is eight per processor, and each keeps its peak; with one per processor, a learner with
+/// 200 actors needs a third less memory and is no slower.
 const ARENAS: &str = "MALLOC_ARENA_MAX";
 
-/// The command that runs this process again in the environment that it needs, or `None` when it has it already. What is set
-/// stays as it is.
+/// The command that re-executes this process with the missing variables, or `None` if all are set. Variables that are set are
+/// not changed.
 fn in_its_environment() -> std::io::Result<Option<Command>> {
     let arenas = processors().to_string();
     let missing = || {
@@ -35,15 +35,16 @@ fn in_its_environment() -> std::io::Result<Option<Command>> {
     let mut command = Command::new(std::env::current_exe()?);
     let mut arguments = std::env::args_os();
     if let Some(name) = arguments.next() {
-        // The name by which it was called may say what it shall do.
+        // The program's behaviour may depend on the name it was called by.
         command.arg0(name);
     }
     command.args(arguments).envs(missing());
     Ok(Some(command))
 }
 
-/// Replaces this process with one that has the environment it needs (single-threaded tensor kernels, an allocator that keeps
-/// its buffers), unless it is such a process already. `main` does this before it starts a thread.
+/// Re-executes this program with the environment that it needs (single-threaded tensor kernels, an allocator that keeps its
+/// buffers), unless all variables are set. `main` calls this before it starts a thread. A debugger or `strace` sees the `exec`;
+/// to avoid it, set the variables. [`log_environment`] logs them once logging is set up.
 pub fn ensure_environment() -> std::io::Result<()> {
     match in_its_environment()? {
         Some(mut command) => Err(command.exec()),
@@ -51,8 +52,16 @@ pub fn ensure_environment() -> std::io::Result<()> {
     }
 }
 
-/// The line that tells a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`,
-/// with `"http"` and where it shows its metrics as a last key if it does.
+/// Logs, at debug level, the variables for which [`ensure_environment`] re-executes the program.
+pub fn log_environment() {
+    for name in ENVIRONMENT.iter().map(|(name, _)| *name).chain([ARENAS]) {
+        let value = std::env::var_os(name).unwrap_or_default();
+        tracing::debug!(variable = name, value = %value.to_string_lossy(), "environment, set by re-executing the program if it was unset");
+    }
+}
+
+/// The line that reports to a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`,
+/// with `"http"`, the address of its metrics, as a last key if there is one.
 pub fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) -> String {
     let json = |address: SocketAddr| serde_json::Value::from(address.to_string());
     let http = http.map_or_else(String::new, |http| format!(",\"http\":{}", json(http)));
@@ -64,36 +73,35 @@ pub fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<Socke
     )
 }
 
-/// A name for this process that means something to a person: host and process number.
+/// A readable name of this process: host and process number.
 pub fn default_name() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let host = if host.trim().is_empty() { "host" } else { host.trim() };
     format!("{host}-{}", std::process::id())
 }
 
-/// Files that this process may have open at once.
+/// The limit of open files of this process.
 pub fn open_files() -> usize {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
     limit.map_or(usize::MAX, |limit| usize::try_from(limit).unwrap_or(usize::MAX))
 }
 
-/// Lets a service open as many files as the system allows it: connections are files.
+/// Raises the limit of open files to the hard limit: connections are files.
 pub fn allow_open_files() {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile);
     let most = rustix::process::Rlimit { current: limit.maximum, ..limit };
-    // Without it there is room for fewer connections.
+    // On failure the service accepts fewer connections.
     if let Err(error) = rustix::process::setrlimit(rustix::process::Resource::Nofile, most) {
-        tracing::debug!(%error, "the limit of open files stays as it is");
+        tracing::debug!(%error, "the limit of open files cannot be raised");
     }
 }
 
-/// Keeps a service to pages of the ordinary size, so that it holds what it uses. With huge ones, which some systems give
-/// unasked, the kernel fills 2 MiB wherever one page of them is in use, some of them hours later: memory that grows and is no
-/// leak.
-pub fn refuse_huge_pages() {
-    // A kernel without huge pages has none to refuse.
+/// Disables transparent huge pages, so that resident memory is the memory in use. With them the kernel maps 2 MiB around every
+/// page in use, sometimes hours later, which looks like a leak.
+pub fn disable_huge_pages() {
+    // Fails on a kernel without huge pages.
     if let Err(error) = rustix::thread::disable_transparent_huge_pages(true) {
-        tracing::debug!(%error, "huge pages stay as they are");
+        tracing::debug!(%error, "transparent huge pages cannot be disabled");
     }
 }
 
@@ -102,16 +110,16 @@ pub fn processors() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Writes text that was asked for (an effective configuration) to standard output.
+/// Writes requested text (an effective configuration) to standard output.
 pub fn print(text: &str) {
-    // A reader that closed the pipe does not want to know.
+    // A closed pipe is not an error.
     let _ = std::io::stdout().lock().write_all(text.as_bytes());
 }
 
-/// Prints [`ready_line`] to standard output: the only thing a running service ever writes there.
+/// Prints [`ready_line`] to standard output, the only line that a running service writes there.
 pub fn announce_ready(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) {
     let mut stdout = std::io::stdout().lock();
-    // A supervisor that closed the pipe does not want to know.
+    // A closed pipe is not an error.
     let _ = writeln!(stdout, "{}", ready_line(service, address, http)).and_then(|()| stdout.flush());
 }
 

@@ -1,47 +1,46 @@
-//! The options of security: certificates, identities, tokens. The same for every service.
+//! The security options of every service: certificates, identities, tokens.
 
-use crate::access::Access;
 use crate::client::{Settings, Token};
-use crate::connections::ConnectionLimits;
 use crate::exit::Failure;
+use crate::net::auth::Access;
+use crate::net::connections::ConnectionLimits;
 use crate::server;
 use crate::tls::{ClientTls, ServerTls};
 use clap::Args;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// How a service guards its port.
+/// The security of a service's port.
 #[derive(Debug, Clone, Default)]
 pub struct Security {
-    /// Certificates; without them nothing is encrypted.
+    /// Certificates; without them connections are not encrypted.
     pub tls: Option<ServerTls>,
-    /// Who is let in.
+    /// The identities that may call.
     pub access: Access,
 }
 
 /// Options of a service that listens.
 #[derive(Debug, Clone, Args, Serialize)]
 pub struct ServerArgs {
-    /// Certificate chain of this service (PEM); it is also what it shows to services that it calls
+    /// Certificate chain of this service (PEM), also used as a client certificate
     #[arg(long, env = "MAGEX_TLS_CERT", value_name = "FILE", requires = "tls_key", help_heading = "Security")]
     pub tls_cert: Option<PathBuf>,
     /// Key of that certificate (PEM)
     #[arg(long, env = "MAGEX_TLS_KEY", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub tls_key: Option<PathBuf>,
-    /// Authority (PEM) that must have signed the certificate that every caller has to show
+    /// CA (PEM) of client certificates; with it every caller must present one
     #[arg(long, env = "MAGEX_CLIENT_CA", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub client_ca: Option<PathBuf>,
-    /// Who may call, with which role: a TOML file of `[[identity]]` entries with hashes of tokens and certificates
+    /// Identities that may call, with their roles: a TOML file of `[[identity]]` entries with hashes of tokens and certificates
     #[arg(long, env = "MAGEX_IDENTITIES", value_name = "FILE", help_heading = "Security")]
     pub identities: Option<PathBuf>,
-    /// Listen on an address that others can reach without encryption, or without asking who calls; send a token
-    /// without encryption
+    /// Allow a non-loopback address without TLS or without authentication, and allow sending a token without TLS
     #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
     pub insecure: bool,
-    /// Connections of all callers
+    /// Maximum number of connections
     #[arg(long, default_value_t = 2048, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
     pub max_connections: u32,
-    /// Connections from one address
+    /// Maximum number of connections from one IP address
     #[arg(long, default_value_t = 1024, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
     pub connections_per_peer: u32,
 }
@@ -62,17 +61,17 @@ impl Default for ServerArgs {
 }
 
 impl ServerArgs {
-    /// How many connections there may be.
+    /// Limits of the connections.
     pub fn connections(&self) -> ConnectionLimits {
         let (total, per_peer) = (self.max_connections as usize, self.connections_per_peer as usize);
         ConnectionLimits { total, per_peer, ..ConnectionLimits::default() }
     }
 
-    /// Reads the files that the options name. An address that others can reach needs encryption and callers that are
-    /// known, unless that was given up by name.
+    /// Reads the files that the options name. A non-loopback address needs TLS and authentication, unless `--insecure` is
+    /// given.
     ///
     /// # Errors
-    /// A file that cannot be used, or an address that is too open: wrong usage.
+    /// Wrong usage: a file is invalid, or the address is exposed.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
         let access = self.identities.as_deref().map(Access::read).transpose().map_err(Failure::usage)?;
         let tls = match (&self.tls_cert, &self.tls_key) {
@@ -86,9 +85,9 @@ impl ServerArgs {
         }
         let security = Security { tls, access: access.unwrap_or_default() };
         if security.access.needs_certificates() && !security.tls.as_ref().is_some_and(ServerTls::mutual) {
-            // Without it no caller is asked for its certificate, and whoever is known by one would be turned away.
+            // Without it no client certificate is requested, so those identities could not authenticate.
             return Err(Failure::usage(
-                "--identities: certificate_sha256 needs --client-ca, so that callers show theirs",
+                "--identities: certificate_sha256 needs --client-ca, so that callers present their certificates",
             ));
         }
         self.check_exposure(listen, &security)?;
@@ -107,33 +106,33 @@ impl ServerArgs {
             _ => "--identities or --client-ca",
         };
         Err(Failure::usage(format!(
-            "--listen {listen}: others can reach this address; add {missing}, or --insecure to let anybody in"
+            "--listen {listen}: other machines can reach this address; add {missing}, or --insecure to accept any client"
         )))
     }
 
-    /// Certificate and key, if there are both.
+    /// Certificate and key, if both are given.
     pub fn own(&self) -> Option<(&Path, &Path)> {
         self.tls_cert.as_deref().zip(self.tls_key.as_deref())
     }
 }
 
-/// Options of whoever calls a service. A token itself is no option: command lines are seen by everybody on a machine.
+/// Options of a client of a service. A token itself is no option, because command lines are visible to all users of a machine.
 #[derive(Debug, Clone, Default, Args, Serialize)]
 pub struct ClientArgs {
-    /// Authority (PEM) that signed the certificates of https services
+    /// CA (PEM) of the certificates of https services
     #[arg(long, env = "MAGEX_TLS_CA", value_name = "FILE", help_heading = "Security")]
     pub tls_ca: Option<PathBuf>,
-    /// File with the bearer token that is sent to services; without it the environment variable MAGEX_TOKEN counts
+    /// File with the bearer token for services [default: the environment variable MAGEX_TOKEN]
     #[arg(long, env = "MAGEX_TOKEN_FILE", value_name = "FILE", help_heading = "Security")]
     pub token_file: Option<PathBuf>,
 }
 
 impl ClientArgs {
-    /// Reads the files that the options name, and the token of the environment if there is no file for it. `own` are the
-    /// caller's certificate and key; `insecure` lets a token travel without encryption.
+    /// Reads the files that the options name, or the token of the environment without a token file. `own` are the client's
+    /// certificate and key; `insecure` allows sending a token without TLS.
     ///
     /// # Errors
-    /// A file that cannot be used: wrong usage.
+    /// Wrong usage: a file is invalid.
     pub fn read(&self, own: Option<(&Path, &Path)>, insecure: bool) -> Result<Settings, Failure> {
         let tls = match &self.tls_ca {
             Some(ca) => Some(ClientTls::read(ca, own.map(|own| own.0), own.map(|own| own.1)).map_err(Failure::usage)?),
@@ -147,20 +146,20 @@ impl ClientArgs {
     }
 }
 
-/// Options of a program that calls services and listens nowhere.
+/// Options of a client that does not listen itself.
 #[derive(Debug, Clone, Default, Args, Serialize)]
 pub struct CallerArgs {
-    /// Whom to trust, and the token.
+    /// CA and token.
     #[command(flatten)]
     #[serde(flatten)]
     pub client: ClientArgs,
-    /// Certificate chain that is shown to services that ask for one (PEM)
+    /// Client certificate chain (PEM)
     #[arg(long, env = "MAGEX_TLS_CERT", value_name = "FILE", requires = "tls_key", help_heading = "Security")]
     pub tls_cert: Option<PathBuf>,
     /// Key of that certificate (PEM)
     #[arg(long, env = "MAGEX_TLS_KEY", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub tls_key: Option<PathBuf>,
-    /// Send the token without encryption to other machines too
+    /// Allow sending the token without TLS to other machines
     #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
     pub insecure: bool,
 }
@@ -169,7 +168,7 @@ impl CallerArgs {
     /// As [`ClientArgs::read`].
     ///
     /// # Errors
-    /// A file that cannot be used: wrong usage.
+    /// Wrong usage: a file is invalid.
     pub fn read(&self) -> Result<Settings, Failure> {
         self.client.read(self.tls_cert.as_deref().zip(self.tls_key.as_deref()), self.insecure)
     }
@@ -181,9 +180,9 @@ mod tests {
     use crate::exit::USAGE;
 
     #[test]
-    fn an_address_that_others_reach_asks_for_certificates_and_names() {
+    fn an_exposed_address_needs_certificates_and_identities() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("who.toml");
+        let path = folder.path().join("identities.toml");
         let hash = "a".repeat(64);
         std::fs::write(&path, format!("[[identity]]\nname = 'a'\nrole = 'admin'\ntoken_sha256 = '{hash}'")).unwrap();
         let open = ServerArgs::default();
@@ -199,9 +198,9 @@ mod tests {
     }
 
     #[test]
-    fn who_is_known_by_a_certificate_has_to_be_asked_for_it() {
+    fn identities_by_certificate_need_a_client_ca() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("who.toml");
+        let path = folder.path().join("identities.toml");
         let hash = "a".repeat(64);
         std::fs::write(&path, format!("[[identity]]\nname = 'a'\nrole = 'admin'\ncertificate_sha256 = '{hash}'"))
             .unwrap();

@@ -1,8 +1,8 @@
 //! Listening and serving.
 
-pub use crate::connections::Incoming;
-use crate::connections::{ConnectionLimits, Connections};
-use crate::door::Open;
+pub use crate::net::connections::Incoming;
+use crate::net::connections::{ConnectionLimits, Connections};
+use crate::net::guard::Guard;
 use crate::tls::{ServerTls, TlsError};
 use std::future::Future;
 use std::io::{Error, ErrorKind};
@@ -14,25 +14,25 @@ use tonic::transport::Server;
 use tonic::transport::server::Router;
 pub use tonic_reflection::server::Error as ReflectionError;
 
-/// How long a server that was told to stop waits for its peers before it leaves them: with what else a service does at its
-/// end, within the budget of 10 s. Streams of ours end at once; this is for peers that say nothing.
+/// How long a server waits after shutdown for open connections before it drops them. Our own streams end at once; this is for
+/// silent peers. With the rest of a service's shutdown it stays within a budget of 10 s.
 pub const GRACE: Duration = Duration::from_secs(3);
 
-/// The option that says where a service listens.
+/// The option with a service's address.
 const LISTEN: &str = "--listen";
 
-/// A socket that cannot be listened on.
+/// Why a service cannot listen.
 #[derive(Debug, thiserror::Error)]
 pub enum BindError {
-    /// The address makes no sense.
+    /// The address is malformed.
     #[error("'{address}' is not an address to listen on: use the form host:port, for example {option} 127.0.0.1:7000")]
     Address {
-        /// What was given.
+        /// The address given.
         address: String,
         /// The option that sets it.
         option: &'static str,
     },
-    /// Somebody else listens there.
+    /// Another process listens there.
     #[error("port {port} is in use ({address}): choose another with {option}, or port 0 for any free one")]
     InUse {
         /// The option that sets it.
@@ -42,14 +42,14 @@ pub enum BindError {
         /// Its port.
         port: u16,
     },
-    /// Anything else.
+    /// Another error of the system.
     #[error("cannot listen on {address}: {source}; choose another with {option}")]
     Other {
         /// The option that sets it.
         option: &'static str,
         /// The address.
         address: String,
-        /// What the system says.
+        /// The error of the system.
         source: Error,
     },
 }
@@ -77,7 +77,7 @@ pub fn incoming(listener: TcpListener) -> Incoming {
     Incoming::new(listener, ConnectionLimits::default())
 }
 
-/// A server with our settings: mute peers are noticed within 15 s, and no connection opens streams without bound.
+/// A server with our settings: silent peers are detected within 15 s, and the streams of a connection are limited.
 pub fn builder() -> Server {
     Server::builder()
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
@@ -91,7 +91,7 @@ pub fn builder() -> Server {
 /// [`builder`], with TLS if there are certificates.
 ///
 /// # Errors
-/// Certificates that cannot be used.
+/// The certificates are invalid.
 pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, TlsError> {
     match tls {
         Some(tls) => builder().tls_config(tls.config()).map_err(|error| TlsError::Unusable(error.to_string())),
@@ -99,10 +99,10 @@ pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, TlsError> {
     }
 }
 
-/// The address that `host:port` stands for.
+/// Resolves `host:port`.
 ///
 /// # Errors
-/// It makes no sense.
+/// The address is malformed or unknown.
 pub fn resolve(listen: &str) -> Result<SocketAddr, BindError> {
     resolve_for(listen, LISTEN)
 }
@@ -112,8 +112,7 @@ fn resolve_for(listen: &str, option: &'static str) -> Result<SocketAddr, BindErr
     listen.to_socket_addrs().map_err(|_| wrong())?.next().ok_or_else(wrong)
 }
 
-/// Serves until `shutdown`, then stops accepting, waits for open calls for at most `grace`, and leaves the rest.
-/// A connection that never says anything cannot hold it up.
+/// Serves until `shutdown`, then stops accepting, waits at most `grace` for open calls, and drops the rest.
 pub async fn serve(
     router: Router,
     incoming: Incoming,
@@ -124,13 +123,13 @@ pub async fn serve(
     match within(serving, shutdown, grace).await {
         Some(result) => result,
         None => {
-            tracing::debug!(grace_seconds = grace.as_secs_f64(), "left connections that did not close");
+            tracing::debug!(grace_seconds = grace.as_secs_f64(), "dropped connections that did not close");
             Ok(())
         }
     }
 }
 
-/// The future's value, unless it is not there `grace` after `shutdown`.
+/// The future's value, or `None` if it is not ready `grace` after `shutdown`.
 pub(crate) async fn within<T>(
     future: impl Future<Output = T>,
     shutdown: CancellationToken,
@@ -142,10 +141,10 @@ pub(crate) async fn within<T>(
     }
 }
 
-/// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set; health is described too.
+/// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set and for health.
 ///
 /// # Errors
-/// Descriptors that cannot be read.
+/// The descriptors cannot be decoded.
 pub fn with_reflection(
     router: Router,
     descriptors: &'static [u8],
@@ -156,8 +155,8 @@ pub fn with_reflection(
             .register_encoded_file_descriptor_set(descriptors)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let router = router.add_service(Open::new(describe().build_v1()?, connections.clone()));
-    Ok(router.add_service(Open::new(describe().build_v1alpha()?, connections.clone())))
+    let router = router.add_service(Guard::public(describe().build_v1()?, connections.clone()));
+    Ok(router.add_service(Guard::public(describe().build_v1alpha()?, connections.clone())))
 }
 
 #[cfg(test)]
@@ -175,7 +174,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_idle_socket_does_not_hold_up_the_end() {
+    async fn an_idle_socket_does_not_delay_shutdown() {
         let (incoming, address) = bind("127.0.0.1:0").await.unwrap();
         let (_health, service) = crate::health::Health::new::<Named>().await;
         let shutdown = CancellationToken::new();

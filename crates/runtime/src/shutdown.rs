@@ -1,4 +1,4 @@
-//! Being told to stop.
+//! Shutdown by signal.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio_util::sync::CancellationToken;

@@ -1,38 +1,38 @@
-//! The error vocabulary of the services.
+//! Statuses with details, shared by the services.
 
 use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-/// INVALID_ARGUMENT with the field named, also as a machine-readable detail.
+/// INVALID_ARGUMENT with the field, also as a google.rpc.BadRequest detail.
 pub fn invalid_argument(field: impl Into<String>, problem: impl Into<String>) -> Status {
     let (field, problem) = (field.into(), problem.into());
     let message = format!("{field}: {problem}");
     Status::with_error_details(Code::InvalidArgument, message, ErrorDetails::with_bad_request_violation(field, problem))
 }
 
-/// FAILED_PRECONDITION: repeating the call does not help until one of the sides is changed.
+/// FAILED_PRECONDITION: retrying does not help until client or server is changed.
 pub fn failed_precondition(message: impl Into<String>) -> Status {
     Status::failed_precondition(message)
 }
 
-/// RESOURCE_EXHAUSTED with a hint when to try again.
+/// RESOURCE_EXHAUSTED with a retry delay.
 pub fn resource_exhausted(message: impl Into<String>, retry: Duration) -> Status {
     Status::with_error_details(Code::ResourceExhausted, message, ErrorDetails::with_retry_info(Some(retry)))
 }
 
-/// UNAVAILABLE with a hint when to try again.
+/// UNAVAILABLE with a retry delay.
 pub fn unavailable(message: impl Into<String>, retry: Duration) -> Status {
     Status::with_error_details(Code::Unavailable, message, ErrorDetails::with_retry_info(Some(retry)))
 }
 
-/// When the other side suggests to try again.
+/// The retry delay of a status.
 pub fn retry_delay(status: &Status) -> Option<Duration> {
     status.get_details_retry_info().and_then(|info| info.retry_delay)
 }
 
-/// A later attempt of the same call may succeed. What tonic makes of a broken connection counts, whatever its code: no server
-/// said it, so it has a cause. So does what arrived damaged.
+/// Whether a retry may succeed. This includes every status that tonic made of a broken connection (it has a source) and damaged
+/// messages.
 pub fn is_transient(status: &Status) -> bool {
     let own = std::error::Error::source(status).is_some();
     own || matches!(
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn details_travel_with_the_status() {
+    fn details_are_part_of_the_status() {
         let status = invalid_argument("agents.array", "missing");
         assert_eq!(status.message(), "agents.array: missing");
         let details = status.get_details_bad_request().unwrap();

@@ -17,13 +17,13 @@ use tracing_subscriber::layer::{Layer, SubscriberExt as _};
 use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt as _;
 
-/// How long the end of a process waits for a collector to take the last spans.
+/// How long a process waits at its end for the last spans to be sent.
 const FLUSH: Duration = Duration::from_secs(1);
-/// A collector that takes longer for a batch does not get it.
+/// Timeout of a batch of spans.
 const EXPORT: Duration = Duration::from_secs(3);
-/// Spans are sent at least so often.
+/// Longest time between two batches.
 const DELAY: Duration = Duration::from_secs(1);
-/// Spans that wait to be sent; more are dropped.
+/// Capacity of the queue of spans; more are dropped.
 const WAITING: usize = 8192;
 
 /// How log lines look.
@@ -45,7 +45,7 @@ pub struct TraceArgs {
     pub otlp: Option<String>,
 }
 
-/// Why telemetry could not be set up.
+/// Why telemetry cannot be set up.
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
     /// The collector's address.
@@ -56,15 +56,15 @@ pub enum TelemetryError {
     Exporter(#[from] opentelemetry_otlp::ExporterBuildError),
 }
 
-/// What must be told when the process ends.
+/// The exporter of traces, to be flushed when the process ends.
 #[derive(Debug)]
-#[must_use = "spans that wait to be sent are lost without a flush"]
+#[must_use = "queued spans are lost without a flush"]
 pub struct Telemetry {
     traces: Option<SdkTracerProvider>,
 }
 
 impl Telemetry {
-    /// Sends what is waiting to be sent, and gives up after a second. Blocks; the runtime must still be there.
+    /// Sends the queued spans, for at most a second. Blocks; the runtime must still run.
     pub fn flush(self) {
         if let Some(traces) = self.traces
             && let Err(error) = traces.shutdown_with_timeout(FLUSH)
@@ -78,8 +78,8 @@ impl Telemetry {
 /// logged, `info` without it. A second call changes nothing. Must be called within a runtime, which the exporter uses.
 ///
 /// # Errors
-/// The collector's address makes no sense. That nobody answers there is no error: spans are dropped.
-pub fn init(service: &'static str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, TelemetryError> {
+/// The collector's address is malformed. A collector that does not answer is no error: spans are dropped.
+pub fn init(service: &str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, TelemetryError> {
     let traces = args.otlp.as_deref().map(|url| provider(service, url)).transpose()?;
     let spans = traces.as_ref().map(|traces| {
         tracing_opentelemetry::layer()
@@ -105,38 +105,38 @@ fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat) -> impl Layer
         LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).with_target(false).boxed(),
         LogFormat::Json => lines.json().flatten_event(true).boxed(),
     };
-    // Spans of traces are none of the log's business, whatever RUST_LOG says.
+    // Spans of traces are not logged, whatever RUST_LOG says.
     lines.with_filter(filter.and(filter_fn(|metadata| !is_traced(metadata))))
 }
 
-fn provider(service: &'static str, url: &str) -> Result<SdkTracerProvider, TelemetryError> {
+fn provider(service: &str, url: &str) -> Result<SdkTracerProvider, TelemetryError> {
     let exporter = opentelemetry_otlp::SpanExporter::builder()
         .with_tonic()
         .with_channel(client::endpoint_from_env(url)?.connect_lazy())
         .with_timeout(EXPORT)
         .build()?;
-    let exporter = Watched { exporter, away: AtomicBool::new(false) };
-    // A thread of its own sends; who makes spans never waits for it.
+    let exporter = LoggedExporter { exporter, unreachable: AtomicBool::new(false) };
+    // A dedicated thread sends; creating a span never waits.
     let batches = BatchConfigBuilder::default().with_max_queue_size(WAITING).with_scheduled_delay(DELAY).build();
     let process = KeyValue::new("service.instance.id", crate::process::default_name());
-    let resource = Resource::builder().with_service_name(service).with_attribute(process).build();
+    let resource = Resource::builder().with_service_name(service.to_owned()).with_attribute(process).build();
     let processor = BatchSpanProcessor::builder(exporter).with_batch_config(batches).build();
     Ok(SdkTracerProvider::builder().with_span_processor(processor).with_resource(resource).build())
 }
 
-/// Says once that the collector is away, and once that it is back.
+/// Logs once that the collector is unreachable, and once that it is back.
 #[derive(Debug)]
-struct Watched {
+struct LoggedExporter {
     exporter: opentelemetry_otlp::SpanExporter,
-    away: AtomicBool,
+    unreachable: AtomicBool,
 }
 
-impl SpanExporter for Watched {
+impl SpanExporter for LoggedExporter {
     async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
         let result = self.exporter.export(batch).await;
-        match (&result, self.away.swap(result.is_err(), Ordering::Relaxed)) {
-            (Err(error), false) => tracing::warn!(%error, "traces are not taken; they are dropped until they are"),
-            (Ok(()), true) => tracing::info!("traces are taken again"),
+        match (&result, self.unreachable.swap(result.is_err(), Ordering::Relaxed)) {
+            (Err(error), false) => tracing::warn!(%error, "the collector does not accept traces; they are dropped"),
+            (Ok(()), true) => tracing::info!("the collector accepts traces again"),
             _ => {}
         }
         result
@@ -161,13 +161,13 @@ mod tests {
     use std::time::Instant;
 
     #[tokio::test]
-    async fn a_collector_that_is_not_there_costs_no_time() {
-        let nobody = crate::http::bind("127.0.0.1:0").await.unwrap().address();
-        let traces = provider("test", &format!("http://{nobody}")).unwrap();
+    async fn an_unreachable_collector_costs_no_time() {
+        let unused = crate::http::bind("127.0.0.1:0").await.unwrap().address();
+        let traces = provider("test", &format!("http://{unused}")).unwrap();
         let start = Instant::now();
         let layer = tracing_opentelemetry::layer().with_tracer(traces.tracer("test"));
         tracing::subscriber::with_default(tracing_subscriber::registry().with(layer), || {
-            // More than may wait.
+            // More than the queue holds.
             (0..3 * WAITING).for_each(|i| drop(tracing::info_span!(target: trace::TARGET, parent: None, "span", i)));
         });
         let flushing = tokio::task::spawn_blocking(|| Telemetry { traces: Some(traces) }.flush());
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_address_that_makes_no_sense_is_named() {
+    async fn a_malformed_address_is_named() {
         let args = TraceArgs { otlp: Some("collector:4317".into()) };
         let error = init("test", LogFormat::Text, &args).unwrap_err().to_string();
         assert!(error.starts_with("--otlp: ") && error.contains("http://host:port"), "{error}");

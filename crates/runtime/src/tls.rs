@@ -3,26 +3,26 @@
 use std::path::{Path, PathBuf};
 use tonic::transport::{Certificate, ClientTlsConfig, Identity, ServerTlsConfig};
 
-/// Certificates that cannot be used.
+/// Why certificates are unusable.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// A file.
+    /// A file cannot be read.
     #[error("{path}: {source}")]
     File {
         /// Its name.
         path: String,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
-    /// A certificate without its key, or the other way round.
+    /// A certificate without its key, or a key without its certificate.
     #[error("{0} and {1} belong together: give both or none")]
     Half(&'static str, &'static str),
-    /// What is in the files.
-    #[error("the certificates cannot be used: {0}")]
+    /// The content of the files.
+    #[error("the certificates are unusable: {0}")]
     Unusable(String),
 }
 
-/// A server's certificate, and whose clients it trusts.
+/// A server's certificate and the CA of its clients.
 #[derive(Clone)]
 pub struct ServerTls {
     certificate: Vec<u8>,
@@ -38,15 +38,15 @@ impl std::fmt::Debug for ServerTls {
 }
 
 impl ServerTls {
-    /// From the server's certificate chain and key; with `client_ca`, every client must show a certificate that it signed.
+    /// Reads the server's certificate chain and key; with `client_ca`, every client must present a certificate of that CA.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// A file cannot be read.
     pub fn read(certificate: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Self, TlsError> {
         Ok(Self { certificate: read(certificate)?, key: read(key)?, client_ca: client_ca.map(read).transpose()? })
     }
 
-    /// Clients must show a certificate.
+    /// Clients must present a certificate.
     pub fn mutual(&self) -> bool {
         self.client_ca.is_some()
     }
@@ -60,7 +60,7 @@ impl ServerTls {
     }
 }
 
-/// Whom a client trusts, and its own certificate if the server wants one.
+/// The CA that a client trusts, and its own certificate.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ClientTls {
     ca: Vec<u8>,
@@ -74,10 +74,10 @@ impl std::fmt::Debug for ClientTls {
 }
 
 impl ClientTls {
-    /// From the authority that signed the server's certificate, and the client's own certificate and key.
+    /// Reads the CA of the server's certificate, and the client's certificate and key.
     ///
     /// # Errors
-    /// A file that cannot be read, or a certificate without its key.
+    /// A file cannot be read, or a certificate has no key.
     pub fn read(ca: &Path, certificate: Option<&Path>, key: Option<&Path>) -> Result<Self, TlsError> {
         let identity = match (certificate, key) {
             (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
@@ -87,14 +87,14 @@ impl ClientTls {
         Ok(Self { ca: read(ca)?, identity })
     }
 
-    /// From the files that `MAGEX_TLS_CA`, and optionally `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY`, name.
+    /// Reads the files that `MAGEX_TLS_CA`, and optionally `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY`, name.
     ///
     /// # Errors
     /// `MAGEX_TLS_CA` is not set, and as [`ClientTls::read`].
     pub fn from_env() -> Result<Self, TlsError> {
         let path = |name: &str| std::env::var_os(name).map(PathBuf::from);
         let ca = path("MAGEX_TLS_CA").ok_or_else(|| {
-            let problem = "set MAGEX_TLS_CA to the file of the authority that signed the service's certificate";
+            let problem = "set MAGEX_TLS_CA to the file of the CA of the service's certificate";
             TlsError::Unusable(problem.to_owned())
         })?;
         Self::read(&ca, path("MAGEX_TLS_CERT").as_deref(), path("MAGEX_TLS_KEY").as_deref())

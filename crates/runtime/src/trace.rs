@@ -1,7 +1,7 @@
-//! Spans of one trace across processes, and how its name travels.
+//! Traces across processes: spans and their propagation.
 //!
-//! The spans that make a trace have [`TARGET`] as their target; nobody looks at them unless traces are exported
-//! ([`crate::telemetry`]), and then they cost one comparison. A trace reaches no number of a run.
+//! Spans of a trace have [`TARGET`] as their target. Unless traces are exported (see `telemetry`) a span costs one comparison.
+//! A trace reaches no number of a run.
 
 use opentelemetry::propagation::TextMapPropagator as _;
 use opentelemetry_sdk::propagation::TraceContextPropagator;
@@ -13,10 +13,10 @@ use tracing_opentelemetry::OpenTelemetrySpanExt as _;
 /// Target of the spans that are exported.
 pub const TARGET: &str = "magex_trace";
 
-/// Name under which a trace travels, in messages and in the headers of calls (W3C Trace Context).
+/// Key of the trace context in messages and in the headers of calls (W3C Trace Context).
 const TRACEPARENT: &str = "traceparent";
 
-/// The span as other processes name it; empty when nobody traces.
+/// The trace context of a span; empty unless traces are exported.
 pub fn traceparent(span: &Span) -> String {
     if span.is_disabled() {
         return String::new();
@@ -26,7 +26,7 @@ pub fn traceparent(span: &Span) -> String {
     carrier.remove(TRACEPARENT).unwrap_or_default()
 }
 
-/// Makes a new span the child of another process's. A name that makes no sense leaves it the root of a trace of its own.
+/// Makes a new span the child of another process's span. With an invalid context it stays the root of its own trace.
 pub fn continue_from(span: &Span, traceparent: &str) {
     if span.is_disabled() || traceparent.is_empty() {
         return;
@@ -34,11 +34,11 @@ pub fn continue_from(span: &Span, traceparent: &str) {
     let carrier = HashMap::from([(TRACEPARENT.to_owned(), traceparent.to_owned())]);
     let parent = TraceContextPropagator::new().extract(&carrier);
     if let Err(error) = span.set_parent(parent) {
-        tracing::debug!(?error, "a span cannot have its parent");
+        tracing::debug!(?error, "the parent of a span cannot be set");
     }
 }
 
-/// Adds the span's name to the headers of a call.
+/// Adds the trace context of a span to the headers of a call.
 pub fn add_to(metadata: &mut MetadataMap, span: &Span) {
     if let Ok(value) = traceparent(span).parse()
         && !span.is_disabled()
@@ -47,7 +47,7 @@ pub fn add_to(metadata: &mut MetadataMap, span: &Span) {
     }
 }
 
-/// The name in the headers of a call; empty if there is none.
+/// The trace context in the headers of a call; empty if absent.
 pub fn of(metadata: &MetadataMap) -> &str {
     metadata.get(TRACEPARENT).and_then(|value| value.to_str().ok()).unwrap_or_default()
 }
@@ -60,7 +60,7 @@ mod tests {
     use tracing_subscriber::layer::SubscriberExt as _;
 
     #[test]
-    fn a_trace_goes_on_in_another_process_and_costs_nothing_when_nobody_looks() {
+    fn a_trace_continues_in_another_process_and_costs_nothing_unless_exported() {
         let span = tracing::info_span!(target: TARGET, "unseen");
         assert_eq!(traceparent(&span), "");
         let provider = SdkTracerProvider::builder().build();

@@ -11,8 +11,8 @@
 use anyhow::Context as _;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::{
-    AssignRequest, Assignment, CreateMissionRequest, DeleteMissionRequest, Member, MemberState, Positions,
-    SchedulerKind, UpdateMissionRequest, WatchAssignmentsRequest, WatchKind,
+    AssignRequest, Assignment, AssignmentMethod, CreateMissionRequest, DeleteMissionRequest, Member, MemberState,
+    Positions, UpdateMissionRequest, WatchAssignmentsRequest, WatchKind,
 };
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
@@ -44,7 +44,7 @@ async fn main() -> anyhow::Result<()> {
         goals: points(&[0.0, 1.0, 4.0, 1.0, 8.0, 1.0]),
         agent_ids: names(["ada", "bob", "cy"]),
         goal_ids: names(["north", "middle", "south"]),
-        scheduler: SchedulerKind::Exact.into(),
+        scheduler: AssignmentMethod::Exact.into(),
         forbidden: vec![magex_proto::v1::PairRef {
             agent_id: "ada".to_owned(),
             goal_id: "north".to_owned(),

@@ -6,7 +6,9 @@ use crate::serve::ledger;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
-use magex_runtime::metrics::{Counter, Counters, Gauge, Gauges, Held, Metrics, Seconds, SecondsBy};
+use magex_runtime::metrics::{
+    Gauge, GaugeGuard, GaugeVec, Histogram, HistogramVec, IntCounter, IntCounterVec, Metrics, raise_to,
+};
 use std::time::Duration;
 
 /// The metrics of the learner.
@@ -14,28 +16,28 @@ use std::time::Duration;
 pub(crate) struct LearnerMetrics {
     shards: LeaseMetrics,
     episodes: LeaseMetrics,
-    pub(crate) received_bytes: Counter,
-    joint_steps: Counter,
-    agent_steps: Counter,
+    pub(crate) received_bytes: IntCounter,
+    joint_steps: IntCounter,
+    agent_steps: IntCounter,
     pub(crate) actors_live: Gauge,
     pub(crate) actors_expected: Gauge,
     pub(crate) actor_threads: Gauge,
-    sessions_ended: Counters,
-    queue: Gauges,
-    policy_lag: Gauges,
-    sample_age: Gauges,
-    iterations: Counter,
-    phase: SecondsBy,
-    bottleneck: Counters,
-    bottleneck_seconds: Gauges,
+    sessions_ended: IntCounterVec,
+    queue: GaugeVec,
+    policy_lag: GaugeVec,
+    sample_age: GaugeVec,
+    iterations: IntCounter,
+    phase: HistogramVec,
+    bottleneck: IntCounterVec,
+    bottleneck_seconds: GaugeVec,
     pub(crate) weights_version: Gauge,
     pub(crate) weights_bytes: Gauge,
-    pub(crate) weights_published: Seconds,
-    subscribers: Gauges,
-    checkpoint: Seconds,
+    pub(crate) weights_published: Histogram,
+    subscribers: GaugeVec,
+    checkpoint: Histogram,
     checkpoint_bytes: Gauge,
-    checkpoint_failures: Counter,
-    skipped: Counter,
+    checkpoint_failures: IntCounter,
+    skipped: IntCounter,
     success: Gauge,
     reward: Gauge,
 }
@@ -106,14 +108,14 @@ impl LearnerMetrics {
                 .gauge("magex_learner_reward_mean", "Mean reward per agent and step of the latest training episodes."),
         };
         // A scrape shows all of them from the start.
-        ENDS.iter().for_each(|reason| metrics.sessions_ended.with(&[reason]).add(0));
-        PHASES.iter().for_each(|phase| drop(metrics.phase.with(&[phase])));
+        ENDS.iter().for_each(|reason| metrics.sessions_ended.with_label_values(&[reason]).inc_by(0));
+        PHASES.iter().for_each(|phase| drop(metrics.phase.with_label_values(&[phase])));
         for stage in Stage::ALL {
-            metrics.bottleneck.with(&[stage.name()]).add(0);
-            metrics.bottleneck_seconds.with(&[stage.name()]).set(0.0);
+            metrics.bottleneck.with_label_values(&[stage.name()]).inc_by(0);
+            metrics.bottleneck_seconds.with_label_values(&[stage.name()]).set(0.0);
         }
         for role in [SubscriberRole::Actor, SubscriberRole::Commander, SubscriberRole::Observer] {
-            metrics.subscribers.with(&[role_name(role)]).set(0.0);
+            metrics.subscribers.with_label_values(&[role_name(role)]).set(0.0);
         }
         set_stats(&metrics.policy_lag, &[]);
         set_stats(&metrics.sample_age, &[]);
@@ -128,21 +130,21 @@ impl LearnerMetrics {
     }
 
     pub(crate) fn queue(&self, name: &str, messages: usize) {
-        self.queue.with(&[name]).set(messages as f64);
+        self.queue.with_label_values(&[name]).set(messages as f64);
     }
 
     pub(crate) fn session_ended(&self, reason: &str) {
-        self.sessions_ended.with(&[reason]).add(1);
+        self.sessions_ended.with_label_values(&[reason]).inc();
     }
 
-    pub(crate) fn subscriber(&self, role: SubscriberRole) -> Held {
-        self.subscribers.with(&[role_name(role)]).hold()
+    pub(crate) fn subscriber(&self, role: SubscriberRole) -> GaugeGuard {
+        GaugeGuard::new(self.subscribers.with_label_values(&[role_name(role)]))
     }
 
     /// Counts the joint steps and agent steps of an accepted result.
     pub(crate) fn accepted(&self, (joint, agent): (u64, u64)) {
-        self.joint_steps.add(joint);
-        self.agent_steps.add(agent);
+        self.joint_steps.inc_by(joint);
+        self.agent_steps.inc_by(agent);
     }
 
     /// The batch is complete.
@@ -154,18 +156,18 @@ impl LearnerMetrics {
     /// An iteration is complete.
     pub(crate) fn iteration(&self, metrics: &IterationMetrics) {
         let timing = &metrics.timing;
-        self.iterations.add(u64::from(metrics.executor.is_some()));
+        self.iterations.inc_by(u64::from(metrics.executor.is_some()));
         let spent = [timing.publish_s, timing.collect_s, timing.executor_s, timing.commander_s, timing.checkpoint_s];
         for (phase, seconds) in PHASES.iter().zip(spent) {
-            self.phase.with(&[phase]).observe(Duration::from_secs_f64(seconds.max(0.0)));
+            self.phase.with_label_values(&[phase]).observe(seconds.max(0.0));
         }
         let Bottleneck { stage, actor_s, learner_s, network_s, .. } = timing.bottleneck;
-        self.bottleneck.with(&[stage.name()]).add(1);
+        self.bottleneck.with_label_values(&[stage.name()]).inc_by(1);
         for (stage, seconds) in Stage::ALL.iter().zip([actor_s, learner_s, network_s]) {
-            self.bottleneck_seconds.with(&[stage.name()]).set(seconds);
+            self.bottleneck_seconds.with_label_values(&[stage.name()]).set(seconds);
         }
         if let Some(skipped) = metrics.executor.as_ref().and_then(|update| update.get("skipped_minibatches")) {
-            self.skipped.add(skipped as u64);
+            self.skipped.inc_by(skipped as u64);
         }
         if let Some(success) = metrics.episodes.get(SUCCESS_RATE) {
             self.success.set(success);
@@ -177,10 +179,10 @@ impl LearnerMetrics {
 
     /// A checkpoint of `bytes` was written, or could not be written.
     pub(crate) fn checkpoint(&self, took: Duration, bytes: Option<u64>) {
-        self.checkpoint.observe(took);
+        self.checkpoint.observe(took.as_secs_f64());
         match bytes {
             Some(bytes) => self.checkpoint_bytes.set(bytes as f64),
-            None => self.checkpoint_failures.add(1),
+            None => self.checkpoint_failures.inc(),
         }
     }
 }
@@ -188,7 +190,7 @@ impl LearnerMetrics {
 /// The conservation ledger, of shards or of episodes.
 #[derive(Debug)]
 struct LeaseMetrics {
-    counters: [Counter; 6],
+    counters: [IntCounter; 6],
     outstanding: Gauge,
     residual: Gauge,
 }
@@ -213,7 +215,7 @@ impl LeaseMetrics {
 
     fn set(&self, c: &ledger::Counters) {
         let totals = [c.leased, c.trained, c.duplicate, c.expired, c.rejected, c.failed];
-        self.counters.iter().zip(totals).for_each(|(counter, total)| counter.raise_to(total));
+        self.counters.iter().zip(totals).for_each(|(counter, total)| raise_to(counter, total));
         self.outstanding.set(c.outstanding as f64);
         self.residual.set(c.residual() as f64);
     }
@@ -236,11 +238,11 @@ fn role_name(role: SubscriberRole) -> &'static str {
 }
 
 /// Sets minimum, mean and maximum; zeros if there are no values.
-fn set_stats(gauges: &Gauges, values: &[f64]) {
+fn set_stats(gauges: &GaugeVec, values: &[f64]) {
     let count = values.len().max(1) as f64;
     let smallest = values.iter().copied().reduce(f64::min).unwrap_or(0.0);
     let largest = values.iter().copied().reduce(f64::max).unwrap_or(0.0);
     for (stat, value) in [("min", smallest), ("mean", values.iter().sum::<f64>() / count), ("max", largest)] {
-        gauges.with(&[stat]).set(value);
+        gauges.with_label_values(&[stat]).set(value);
     }
 }

@@ -10,12 +10,12 @@ use crate::serve::validate::Limits;
 use crate::serve::weights_board;
 use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer};
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_MESSAGE_BYTES, v1};
-use magex_runtime::access::{Role, caller};
-use magex_runtime::admission::{Admission, FlightLimits};
-use magex_runtime::deadline::Deadline;
-use magex_runtime::door::{Door, Open, Rules};
 use magex_runtime::health::Health;
 use magex_runtime::http::{self, Router};
+use magex_runtime::net::auth::{Role, caller};
+use magex_runtime::net::deadline::WithDeadline;
+use magex_runtime::net::guard::{Guard, Rules};
+use magex_runtime::net::in_flight::{InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
 use magex_runtime::status;
@@ -33,8 +33,8 @@ pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
 /// Streaming methods.
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
-/// Limits in flight, per caller and in total. All actors of a run may be one caller.
-const FLIGHTS: FlightLimits = FlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
+/// What one caller, and everybody, may have in flight. All actors of a run may be one caller.
+const IN_FLIGHT: InFlightLimits = InFlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
 
 /// The two ends of the service: one for the network, one for the training thread.
 pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, GrpcCollector) {
@@ -86,15 +86,14 @@ impl LearnerHandle {
         let connections = incoming.connections();
         let rules = Rules {
             access: self.security.access.clone(),
-            // The service itself rejects calls during a shutdown, with the reason.
-            admission: Admission::new(FLIGHTS, CancellationToken::new()),
+            // Callers learn from the service itself that it stops, and why.
+            in_flight: InFlight::new(IN_FLIGHT, CancellationToken::new()),
             streams: STREAMS,
             message_bytes: MAX_MESSAGE_BYTES,
-            connections: connections.clone(),
         };
         let router = server::secure_builder(self.security.tls.as_ref())?
-            .add_service(Open::new(health_service, connections.clone()))
-            .add_service(Door::new(Deadline::new(service), rules));
+            .add_service(Guard::public(health_service, connections.clone()))
+            .add_service(Guard::guarded(WithDeadline::new(service), rules, connections.clone()));
         let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
         let shared = self.shared.clone();
         let stopped = shutdown.clone();
@@ -198,7 +197,7 @@ impl LearnerService for LearnerApi {
             let _subscribed = subscribed;
             let sent = |version| {
                 if let Some(since) = shared.board.since(version) {
-                    shared.metrics.weights_published.observe(since.elapsed());
+                    shared.metrics.weights_published.observe(since.elapsed().as_secs_f64());
                 }
             };
             closing.run_until_cancelled(weights_board::stream(board, toml, reader, patience, sent)).await;

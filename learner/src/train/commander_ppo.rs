@@ -254,19 +254,5 @@ pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) 
 
 /// C: summed distance of an assignment, in double precision; agents without a goal cost nothing.
 pub fn cost(team: &Team<'_>, goals: &[u32]) -> f64 {
-    let d = team.dims;
-    goals
-        .iter()
-        .enumerate()
-        .filter(|(_, goal)| **goal != u32::MAX)
-        .map(|(agent, &goal)| {
-            let square: f64 = (0..d)
-                .map(|k| {
-                    let gap = f64::from(team.agents[agent * d + k]) - f64::from(team.goals[goal as usize * d + k]);
-                    gap * gap
-                })
-                .sum();
-            square.sqrt()
-        })
-        .sum()
+    magex_assign::cost_of_points(team.agents, team.goals, team.dims, goals)
 }

@@ -2,7 +2,7 @@
 
 use crate::small;
 use bytes::Bytes;
-use magex_commander::trained::load_scheduler;
+use magex_commander::run_scheduler::load_scheduler;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::ShardResult;

@@ -4,7 +4,7 @@ use crate::clients::team;
 use crate::sandbox::*;
 use crate::security::{bearing, code, identities};
 use magex_actor::run::ActorConfig;
-use magex_commander::service::CommanderConfig;
+use magex_commander::service::ServiceConfig;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
@@ -76,7 +76,7 @@ async fn certificates_are_asked_for_checked_and_carry_roles() {
     let tls = server.server(Some(&authority));
     let access = identities(folder.path(), &entries);
     let security = Security { tls: Some(tls), access };
-    let config = CommanderConfig { security, ..CommanderConfig::default() };
+    let config = ServiceConfig { security, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     let url = commander.url.replace("http://", "https://");
     let ask = async |own: Option<&Signed>, ca: &Signed| {
@@ -119,7 +119,7 @@ async fn a_cluster_trains_behind_certificates_and_tokens() {
     let learner_url = https(&learner.url);
     let (client, security) = (shown("goals"), guarded());
     let config_ =
-        CommanderConfig { learner_url: Some(learner_url.clone()), client, security, ..CommanderConfig::default() };
+        ServiceConfig { learner_url: Some(learner_url.clone()), client, security, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config_, load_fake).await;
     let (client, commander_url) = (shown("rollouts"), https(&commander.url));
     let config_ = ActorConfig { client, commander_url, ..config(&learner_url, "a") };

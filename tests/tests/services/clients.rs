@@ -1,8 +1,8 @@
 //! Outside clients: one team, many, streams; what stands in for what, and what a stop looks like to them.
 
 use crate::sandbox::*;
-use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest};
-use magex_commander::service::CommanderConfig;
+use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
 use magex_proto::v1;
 use magex_proto::v1::assign_stream_response::Result as StreamResult;
@@ -50,18 +50,18 @@ async fn every_scheduler_and_every_kind_of_cost_over_the_wire() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;
     for (kind, expected) in [
-        (v1::SchedulerKind::Exact, vec![1, 0]),
-        (v1::SchedulerKind::ExactMakespan, vec![1, 0]),
-        (v1::SchedulerKind::Greedy, vec![1, 0]),
+        (v1::AssignmentMethod::Exact, vec![1, 0]),
+        (v1::AssignmentMethod::Makespan, vec![1, 0]),
+        (v1::AssignmentMethod::Greedy, vec![1, 0]),
     ] {
         let reply = client.assign(v1::AssignRequest { scheduler: kind.into(), ..team() }).await.unwrap().into_inner();
         assert_eq!((reply.scheduler(), goals(&reply)), (kind, expected));
         assert_eq!((reply.largest_cost, reply.exact_cost, reply.gap), (0.5, Some(0.5), Some(0.0)));
     }
-    let random = v1::AssignRequest { scheduler: v1::SchedulerKind::Random.into(), seed: Some(3), ..team() };
+    let random = v1::AssignRequest { scheduler: v1::AssignmentMethod::Random.into(), seed: Some(3), ..team() };
     let (one, two) = (client.assign(random.clone()).await.unwrap(), client.assign(random).await.unwrap());
     assert_eq!(one.into_inner().pairs, two.into_inner().pairs);
-    let exact = v1::AssignRequest { scheduler: v1::SchedulerKind::Exact.into(), ..team() };
+    let exact = v1::AssignRequest { scheduler: v1::AssignmentMethod::Exact.into(), ..team() };
     let banned = v1::AssignRequest { forbidden: vec![pair(0, 1)], ..exact.clone() };
     assert_eq!(goals(client.assign(banned).await.unwrap().get_ref()), [0, 1]);
     let sticky = v1::AssignRequest { current: vec![pair(0, 0), pair(1, 1)], switching_cost: 5.0, ..exact.clone() };
@@ -74,7 +74,7 @@ async fn every_scheduler_and_every_kind_of_cost_over_the_wire() {
     let reply = reply.into_inner();
     assert_eq!((goals(&reply), reply.cost, reply.unassigned_goals.clone()), (vec![1], 1.0, vec![0, 2]));
     assert_eq!(reply.goals_without_agent[0].reason(), v1::UnassignedReason::Outnumbered);
-    assert_eq!(reply.fallback_reason, "the learned scheduler knows positions, not costs");
+    assert_eq!(reply.fallback_reason, "the learned scheduler supports positions only, not costs");
     commander.stop().await;
 }
 
@@ -151,11 +151,11 @@ impl Gate {
 struct SlowScheduler(&'static Gate);
 
 impl Scheduler for SlowScheduler {
-    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
-        Err(AssignError::Unsupported("not for actors".into()))
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, SchedulerError> {
+        Err(SchedulerError::Unsupported("not for actors".into()))
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
         self.0.pass();
         let goals = (0..request.agent_count as u32).map(Some).collect();
         Ok(TeamReply { goals, probabilities: None })
@@ -165,11 +165,11 @@ impl Scheduler for SlowScheduler {
 static SLOW: Gate = Gate::new();
 static DRAINED: Gate = Gate::new();
 
-fn load_slow(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+fn load_slow(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     Ok(Arc::new(SlowScheduler(&SLOW)))
 }
 
-fn load_drained(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+fn load_drained(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     Ok(Arc::new(SlowScheduler(&DRAINED)))
 }
 
@@ -177,16 +177,16 @@ fn load_drained(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
 struct BrokenScheduler;
 
 impl Scheduler for BrokenScheduler {
-    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, SchedulerError> {
         panic!("broken")
     }
 
-    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, AssignError> {
+    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, SchedulerError> {
         panic!("broken")
     }
 }
 
-fn load_broken(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+fn load_broken(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     Ok(Arc::new(BrokenScheduler))
 }
 
@@ -194,7 +194,7 @@ fn load_broken(_: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
 async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
     let folder = run_folder(b"weights");
     let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
-    let config = CommanderConfig { weights, ..CommanderConfig::default() };
+    let config = ServiceConfig { weights, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config.clone(), load_slow).await;
     let mut client = commander_client(&commander.url).await;
     let asked = |n, seconds| v1::AssignRequest {
@@ -206,9 +206,9 @@ async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
     for n in [2, 100] {
         for seconds in [4.0, 6.0] {
             let reply = client.assign(asked(n, seconds)).await.unwrap().into_inner();
-            assert_eq!(reply.scheduler(), v1::SchedulerKind::Exact);
+            assert_eq!(reply.scheduler(), v1::AssignmentMethod::Exact);
             // Those that were given up still hold their processors.
-            let reasons = ["the model took longer than", "all processors are busy with the model"];
+            let reasons = ["the model exceeded its time limit of", "all processors are busy"];
             assert!(
                 reasons.iter().any(|reason| reply.fallback_reason.starts_with(reason)),
                 "{}",
@@ -228,7 +228,7 @@ async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
             }
         };
         let reply = within(learned).await;
-        assert_eq!((reply.scheduler(), reply.version), (v1::SchedulerKind::Learned, 0));
+        assert_eq!((reply.scheduler(), reply.version), (v1::AssignmentMethod::Learned, 0));
         assert_eq!(reply.run_id, folder.path().file_name().unwrap().to_str().unwrap());
     }
     commander.stop().await;
@@ -237,7 +237,7 @@ async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
     let mut client = commander_client(&commander.url).await;
     let reply = client.assign(team()).await.unwrap().into_inner();
     // Where a backtrace is written it is late as well.
-    assert!(reply.scheduler() == v1::SchedulerKind::Exact && reply.fallback_reason.starts_with("the model "));
+    assert!(reply.scheduler() == v1::AssignmentMethod::Exact && reply.fallback_reason.starts_with("the model "));
     commander.stop().await;
 }
 
@@ -249,7 +249,7 @@ async fn a_deadline_ends_the_work_and_the_next_caller_does_not_notice() {
     let n = 1200u32;
     let values = (0..n * n).map(|k| f64::from((k / n + 1) * (k % n + 1))).collect();
     let costs = Some(v1::CostMatrix { agents: n, goals: n, values });
-    let scheduler = v1::SchedulerKind::Exact.into();
+    let scheduler = v1::AssignmentMethod::Exact.into();
     let hard = v1::AssignRequest { costs, scheduler, deadline_seconds: Some(0.05), ..Default::default() };
     let start = Instant::now();
     let status = client.assign(hard).await.unwrap_err();
@@ -264,7 +264,7 @@ async fn a_deadline_ends_the_work_and_the_next_caller_does_not_notice() {
 async fn a_service_that_drains_says_so_and_finishes_what_it_has_begun() {
     let folder = run_folder(b"weights");
     let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
-    let config = CommanderConfig { weights, drain: Duration::from_secs(5), ..CommanderConfig::default() };
+    let config = ServiceConfig { weights, drain: Duration::from_secs(5), ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_drained).await;
     let mut client = commander_client(&commander.url).await;
     let mut health = HealthClient::new(client::endpoint(&commander.url).unwrap().connect().await.unwrap());
@@ -285,6 +285,6 @@ async fn a_service_that_drains_says_so_and_finishes_what_it_has_begun() {
     assert_eq!(refused.code(), Code::Unavailable);
     assert!(status::retry_delay(&refused).is_some());
     DRAINED.open();
-    assert_eq!(within(begun).await.unwrap().unwrap().into_inner().scheduler(), v1::SchedulerKind::Learned);
+    assert_eq!(within(begun).await.unwrap().unwrap().into_inner().scheduler(), v1::AssignmentMethod::Learned);
     commander.stop().await;
 }

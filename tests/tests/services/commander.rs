@@ -102,7 +102,7 @@ async fn outside_clients_get_assignments_with_and_without_a_model() {
         ..Default::default()
     };
     let reply = client.assign(request.clone()).await.unwrap().into_inner();
-    assert_eq!(reply.scheduler(), v1::SchedulerKind::Exact);
+    assert_eq!(reply.scheduler(), v1::AssignmentMethod::Exact);
     assert_eq!(reply.fallback_reason, "no model is loaded");
     assert_eq!((reply.pairs[0].goal_index, reply.pairs[0].agent_id.as_str()), (1, "a"));
     assert!((reply.cost - 0.5).abs() < 1e-9 && reply.gap == Some(0.0));
@@ -119,13 +119,13 @@ async fn outside_clients_get_assignments_with_and_without_a_model() {
     })
     .await;
     let reply = client.assign(request.clone()).await.unwrap().into_inner();
-    assert_eq!((reply.scheduler(), reply.version, reply.run_id.as_str()), (v1::SchedulerKind::Learned, 3, "run"));
+    assert_eq!((reply.scheduler(), reply.version, reply.run_id.as_str()), (v1::AssignmentMethod::Learned, 3, "run"));
     assert_eq!((reply.pairs[0].goal_index, reply.pairs[0].probability), (0, Some(0.5)));
     assert!(reply.gap.unwrap() > 1.0 && reply.fallback_reason.is_empty());
     // What the model cannot do the exact solver does.
     let more = v1::AssignRequest { goals: positions(&[3.0, 4.0]), ..request.clone() };
     let reply = client.assign(more).await.unwrap().into_inner();
-    assert_eq!((reply.scheduler(), reply.unassigned_agents.as_slice()), (v1::SchedulerKind::Exact, &[0][..]));
+    assert_eq!((reply.scheduler(), reply.unassigned_agents.as_slice()), (v1::AssignmentMethod::Exact, &[0][..]));
     assert!(reply.fallback_reason.contains("as many goals as agents"));
     let bad = v1::AssignRequest { goals: positions(&[3.0, f32::NAN]), ..request };
     let status = client.assign(bad).await.unwrap_err();

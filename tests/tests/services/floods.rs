@@ -3,11 +3,11 @@
 use crate::certificates::{Signed, sign, trusting};
 use crate::clients::team;
 use crate::sandbox::*;
-use magex_commander::service::CommanderConfig;
+use magex_commander::service::ServiceConfig;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::client::{Settings, endpoint};
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use magex_runtime::security::Security;
 use magex_runtime::status;
 use std::pin::Pin;
@@ -43,7 +43,7 @@ fn address(url: &str) -> &str {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn idle_sockets_evict_each_other_and_no_client_that_asks() {
-    let commander = Commander::start_within(FEW, CommanderConfig::default()).await;
+    let commander = Commander::start_within(FEW, ServiceConfig::default()).await;
     let mut client = commander_client(&commander.url).await;
     client.assign(team()).await.unwrap();
     let mut idle = Vec::new();
@@ -66,7 +66,7 @@ async fn idle_sockets_evict_each_other_and_no_client_that_asks() {
 #[tokio::test(flavor = "multi_thread")]
 async fn callers_that_are_at_work_keep_their_places() {
     let limits = ConnectionLimits { total: 3, per_peer: 3, ..FEW };
-    let commander = Commander::start_within(limits, CommanderConfig::default()).await;
+    let commander = Commander::start_within(limits, ServiceConfig::default()).await;
     let mut clients = Vec::new();
     for _ in 0..3 {
         let mut client = commander_client(&commander.url).await;
@@ -91,8 +91,8 @@ async fn handshakes_that_do_not_end_are_ended() {
     let server = sign(folder.path(), "server", Some(&authority));
     let limits = ConnectionLimits { first_call: Duration::from_secs(1), ..FEW };
     let security = Security { tls: Some(server.server(None)), ..Security::default() };
-    let secure = Commander::start_within(limits, CommanderConfig { security, ..CommanderConfig::default() }).await;
-    let plain = Commander::start_within(limits, CommanderConfig::default()).await;
+    let secure = Commander::start_within(limits, ServiceConfig { security, ..ServiceConfig::default() }).await;
+    let plain = Commander::start_within(limits, ServiceConfig::default()).await;
     // The first bytes of a TLS handshake, and of HTTP/2, one now and then.
     let drip = async |url: String, bytes: &'static [u8]| {
         let mut socket = TcpStream::connect(address(&url)).await.unwrap();
@@ -163,7 +163,7 @@ async fn announce(open: &mut JoinSet<Option<Status>>, channel: &Channel, length:
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_announced_counts_before_it_arrives() {
-    let commander = Commander::start_within(ConnectionLimits::default(), CommanderConfig::default()).await;
+    let commander = Commander::start_within(ConnectionLimits::default(), ServiceConfig::default()).await;
     let channel = endpoint(&commander.url).unwrap().connect().await.unwrap();
     // One caller may have 64 MiB on their way.
     let mut open = JoinSet::new();
@@ -184,7 +184,7 @@ async fn what_is_announced_counts_before_it_arrives() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_call_counts_from_its_headers_on() {
-    let config = CommanderConfig { calls: 2, ..CommanderConfig::default() };
+    let config = ServiceConfig { calls: 2, ..ServiceConfig::default() };
     let commander = Commander::start_within(ConnectionLimits::default(), config).await;
     let channel = endpoint(&commander.url).unwrap().connect().await.unwrap();
     let mut open = JoinSet::new();

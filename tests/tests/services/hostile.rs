@@ -5,13 +5,15 @@ use crate::clients::team;
 use crate::floods::{healthy, post};
 use crate::sandbox::*;
 use crate::security::{all_roles, commander_as, guarded};
-use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest, WeightsKey};
-use magex_commander::service::CommanderConfig;
+use magex_commander::scheduler::{
+    AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest, WeightsKey,
+};
+use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::v1;
 use magex_runtime::client::endpoint;
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -110,13 +112,16 @@ async fn what_a_caller_made_long_comes_back_short() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn shards_that_do_not_exist_are_refused() {
-    let commander = Commander::start("127.0.0.1:0", None).await;
+async fn impossible_shards_are_rejected() {
+    let folder = run_folder(b"weights");
+    let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
+    let config = ServiceConfig { weights, ..ServiceConfig::default() };
+    let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     let mut client = commander_client(&commander.url).await;
+    let model = client.get_model(v1::GetModelRequest {}).await.unwrap().into_inner();
     let shard = plan(0, 1)[0];
-    let key = WeightsKey { run_id: RunId("r".into()), version: WeightsVersion(0), sha256: "ab".into() };
-    let scheduler = magex_commander::scheduler::SchedulerKind::Exact;
-    let good = GoalRequest { scheduler, ..goal_request(&task(), &shard) };
+    let key = WeightsKey { run_id: RunId(model.run_id), version: WeightsVersion(model.version), sha256: model.sha256 };
+    let good = goal_request(&task(), &shard);
     client.assign_batch(good.to_message(&key)).await.unwrap();
     let shaped = |agents: [u32; 4], goals: [u32; 4]| {
         let mut message = good.to_message(&key);
@@ -133,7 +138,6 @@ async fn shards_that_do_not_exist_are_refused() {
         (shaped([b, u32::MAX, 0, 2], [b, u32::MAX, 0, 2]), "agents.shape[2]"),
         (shaped([b, 1, 1, 0], [b, 1, 1, 0]), "agents.shape[3]"),
         (v1::AssignBatchRequest { run_id: "r".repeat(1000), ..good.to_message(&key) }, "run_id"),
-        (v1::AssignBatchRequest { scheduler: 77, ..good.to_message(&key) }, "scheduler"),
     ] {
         assert_eq!(field(&within(client.assign_batch(message)).await.unwrap_err()), path);
     }
@@ -145,7 +149,7 @@ async fn shards_that_do_not_exist_are_refused() {
 async fn unknown_callers_are_evicted_for_known_ones() {
     let folder = tempfile::tempdir().unwrap();
     let limits = ConnectionLimits { total: 3, per_peer: 3, first_call: Duration::from_secs(60) };
-    let config = CommanderConfig { security: guarded(all_roles(folder.path())), ..CommanderConfig::default() };
+    let config = ServiceConfig { security: guarded(all_roles(folder.path())), ..ServiceConfig::default() };
     let commander = Commander::start_within(limits, config).await;
     let mut strangers = Vec::new();
     for _ in 0..3 {
@@ -183,16 +187,16 @@ async fn too_many_health_watches_are_refused_and_probes_are_answered() {
 struct Classical;
 
 impl Scheduler for Classical {
-    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
-        Err(AssignError::Interrupted)
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, SchedulerError> {
+        Err(SchedulerError::Interrupted)
     }
 
-    fn teams(&self) -> bool {
-        false
+    fn method(&self) -> AssignmentMethod {
+        AssignmentMethod::Exact
     }
 
-    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, AssignError> {
-        Err(AssignError::Unsupported("the run has no learned commander".into()))
+    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+        Err(SchedulerError::Unsupported("the run has no learned commander".into()))
     }
 }
 
@@ -200,14 +204,14 @@ impl Scheduler for Classical {
 async fn a_run_without_a_learned_commander_offers_none() {
     let folder = run_folder(b"weights");
     let weights = Some(WeightsFile::find(folder.path(), None).unwrap());
-    let config = CommanderConfig { weights, ..CommanderConfig::default() };
+    let config = ServiceConfig { weights, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, |_, _| Ok(Arc::new(Classical))).await;
     let mut client = commander_client(&commander.url).await;
     let model = client.get_model(v1::GetModelRequest {}).await.unwrap().into_inner();
     assert!(!model.ready && !model.sha256.is_empty());
-    assert!(!model.schedulers.contains(&v1::SchedulerKind::Learned.into()), "{:?}", model.schedulers);
+    assert!(!model.schedulers.contains(&v1::AssignmentMethod::Learned.into()), "{:?}", model.schedulers);
     let reply = client.assign(team()).await.unwrap().into_inner();
-    assert_eq!(reply.scheduler(), v1::SchedulerKind::Exact);
+    assert_eq!(reply.scheduler(), v1::AssignmentMethod::Exact);
     assert!(reply.fallback_reason.contains("no learned commander"), "{}", reply.fallback_reason);
     commander.stop().await;
 }

@@ -1,7 +1,7 @@
 //! Missions over the wire: their life, their watchers, what a restart leaves, and training episodes beside them.
 
 use crate::sandbox::*;
-use magex_commander::service::CommanderConfig;
+use magex_commander::service::ServiceConfig;
 use magex_dispatch::mission::MissionLimits;
 use magex_dispatch::missions::Bounds;
 use magex_learner::collector::Collector as _;
@@ -63,8 +63,8 @@ async fn next(stream: &mut Streaming<v1::WatchAssignmentsResponse>) -> (v1::Watc
     (kind, a.mission_id, a.revision)
 }
 
-fn with_data(folder: &Path, missions: Bounds) -> CommanderConfig {
-    CommanderConfig { data: Some(folder.to_owned()), missions, ..CommanderConfig::default() }
+fn with_data(folder: &Path, missions: Bounds) -> ServiceConfig {
+    ServiceConfig { data: Some(folder.to_owned()), missions, ..ServiceConfig::default() }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -4,10 +4,8 @@ use bytes::Bytes;
 use magex_actor::goal_client::{GoalRequest, GoalSource};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
-use magex_commander::scheduler::{
-    AssignError, GoalReply, LoadScheduler, Scheduler, SchedulerKind, TeamReply, TeamRequest,
-};
-use magex_commander::service::CommanderConfig;
+use magex_commander::scheduler::{GoalReply, LoadScheduler, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::service::ServiceConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
 use magex_core::rng::{Key, Purpose};
@@ -27,7 +25,7 @@ use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::weights::Weights;
 use magex_proto::{PROTOCOL_VERSION, parts, v1};
-use magex_runtime::connections::ConnectionLimits;
+use magex_runtime::net::connections::ConnectionLimits;
 use magex_runtime::security::Security;
 use magex_runtime::{client, server};
 use std::sync::Arc;
@@ -236,8 +234,7 @@ pub(crate) fn goal_request(task: &TaskConfig, shard: &Shard) -> GoalRequest {
     let (b, n) = (shard.episodes as usize, task.agents);
     let points: Vec<f32> = (0..b * n * 2).map(|i| i as f32).collect();
     let (shard, agents, goals) = (*shard, points.clone(), points);
-    let scheduler = SchedulerKind::Learned;
-    GoalRequest { shard, seed: SEED, scheduler, stages: 1, agent_count: n, goal_count: n, dims: 2, agents, goals }
+    GoalRequest { shard, seed: SEED, stages: 1, agent_count: n, goal_count: n, dims: 2, agents, goals }
 }
 
 impl Worker for FakeWorker {
@@ -375,25 +372,25 @@ pub(crate) async fn learner_client(url: &str) -> LearnerServiceClient<Channel> {
 pub(crate) struct FakeScheduler;
 
 impl Scheduler for FakeScheduler {
-    fn assign_batch(&self, request: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
+    fn assign_batch(&self, request: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, SchedulerError> {
         let b = request.shard.episodes as usize * request.stages;
         let n = request.agent_count as u32;
         let goals = (0..b).flat_map(|_| 0..n).collect();
         Ok(GoalReply { goals, log_probs: vec![-1.0; b], costs: vec![2.0; b], exact_costs: vec![1.0; b] })
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
         if request.agent_count != request.goal_count {
-            return Err(AssignError::Unsupported("as many goals as agents are needed".into()));
+            return Err(SchedulerError::Unsupported("as many goals as agents are needed".into()));
         }
         let n = request.agent_count as u32;
         Ok(TeamReply { goals: (0..n).map(Some).collect(), probabilities: Some(vec![0.5; n as usize]) })
     }
 }
 
-pub(crate) fn load_fake(bytes: &[u8], _config: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
+pub(crate) fn load_fake(bytes: &[u8], _config: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     if bytes.is_empty() {
-        return Err(AssignError::Failed("no weights in there".into()));
+        return Err(SchedulerError::Load("no weights in there".into()));
     }
     Ok(Arc::new(FakeScheduler))
 }
@@ -407,10 +404,10 @@ pub(crate) struct Commander {
 impl Commander {
     pub(crate) async fn start(listen: &str, learner_url: Option<&str>) -> Self {
         let learner_url = learner_url.map(Into::into);
-        Self::start_with(listen, CommanderConfig { learner_url, ..CommanderConfig::default() }, load_fake).await
+        Self::start_with(listen, ServiceConfig { learner_url, ..ServiceConfig::default() }, load_fake).await
     }
 
-    pub(crate) async fn start_with(listen: &str, config: CommanderConfig, load: LoadScheduler) -> Self {
+    pub(crate) async fn start_with(listen: &str, config: ServiceConfig, load: LoadScheduler) -> Self {
         let (incoming, address) = server::bind(listen).await.unwrap();
         let shutdown = CancellationToken::new();
         let run = magex_commander::service::run(config, load, incoming, shutdown.clone());
@@ -419,7 +416,7 @@ impl Commander {
     }
 
     /// With a limited number of connections.
-    pub(crate) async fn start_within(limits: ConnectionLimits, config: CommanderConfig) -> Self {
+    pub(crate) async fn start_within(limits: ConnectionLimits, config: ServiceConfig) -> Self {
         let (incoming, address) = server::bind("127.0.0.1:0").await.unwrap();
         let shutdown = CancellationToken::new();
         let run = magex_commander::service::run(config, load_fake, incoming.within(limits), shutdown.clone());

@@ -2,15 +2,15 @@
 
 use crate::clients::{positions, team};
 use crate::sandbox::*;
-use magex_commander::service::CommanderConfig;
+use magex_commander::service::ServiceConfig;
 use magex_dispatch::Limits;
 use magex_learner::collector::Collector as _;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::weights::sha256_hex;
-use magex_runtime::access::Access;
 use magex_runtime::client::{Channel, Settings, Token};
+use magex_runtime::net::auth::Access;
 use magex_runtime::security::Security;
 use std::path::Path;
 use tonic::{Code, Status};
@@ -62,7 +62,7 @@ const MISSING: Option<Code> = Some(Code::NotFound);
 #[tokio::test(flavor = "multi_thread")]
 async fn every_method_of_the_commander_opens_for_its_roles_only() {
     let folder = tempfile::tempdir().unwrap();
-    let config = CommanderConfig { security: guarded(all_roles(folder.path())), ..CommanderConfig::default() };
+    let config = ServiceConfig { security: guarded(all_roles(folder.path())), ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     // What a call ends with that was let in: some of these ask for nothing that there is.
     let let_in = [None, None, None, None, INVALID, MISSING, MISSING, None, None, MISSING, None];
@@ -168,7 +168,7 @@ async fn an_actor_that_the_commander_does_not_let_in_ends_and_its_shard_is_done_
     let folder = tempfile::tempdir().unwrap();
     let mut learner = Learner::start().await;
     let (security, learner_url) = (guarded(all_roles(folder.path())), Some(learner.url.clone()));
-    let config = CommanderConfig { security, learner_url, ..CommanderConfig::default() };
+    let config = ServiceConfig { security, learner_url, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     learner.collector.publish(&weights(0)).unwrap();
     learner.collector.open(plan(0, 3)).unwrap();
@@ -199,13 +199,13 @@ async fn an_actor_that_the_commander_does_not_let_in_ends_and_its_shard_is_done_
 #[tokio::test(flavor = "multi_thread")]
 async fn sizes_and_calls_in_flight_are_limited() {
     let limits = Limits { members: 3, ..Limits::default() };
-    let config = CommanderConfig { limits, message_bytes: 4096, calls: 1, streams: 1, ..CommanderConfig::default() };
+    let config = ServiceConfig { limits, message_bytes: 4096, calls: 1, streams: 1, ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_fake).await;
     let mut client = commander_client(&commander.url).await;
     let large = v1::AssignRequest { agents: positions(&[0.0; 8]), ..team() };
     let status = client.assign(large).await.unwrap_err();
     assert!(
-        status.code() == Code::InvalidArgument && status.message().contains("4 points are more than 3"),
+        status.code() == Code::InvalidArgument && status.message().contains("4 points exceed the limit of 3"),
         "{status}"
     );
     let huge = v1::AssignRequest { agents: positions(&[0.0; 3000]), ..team() };

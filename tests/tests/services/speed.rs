@@ -87,7 +87,7 @@ async fn assignments_of_fifty_agents() {
     };
     let mut times = Vec::new();
     for _ in 0..2000 {
-        let scheduler = v1::SchedulerKind::Exact.into();
+        let scheduler = v1::AssignmentMethod::Exact.into();
         let request = v1::AssignRequest { agents: points(), goals: points(), scheduler, ..Default::default() };
         let start = Instant::now();
         client.assign(request).await.unwrap();

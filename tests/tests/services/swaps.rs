@@ -2,8 +2,8 @@
 
 use crate::clients::positions;
 use crate::sandbox::*;
-use magex_commander::scheduler::{AssignError, GoalReply, GoalRequest, Scheduler, TeamReply, TeamRequest};
-use magex_commander::service::CommanderConfig;
+use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
 use magex_learner::collector::Collector as _;
 use magex_proto::v1;
@@ -15,11 +15,11 @@ use std::time::Duration;
 struct Numbered(u32);
 
 impl Scheduler for Numbered {
-    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, AssignError> {
-        Err(AssignError::Unsupported("not for actors".into()))
+    fn assign_batch(&self, _: &GoalRequest, _: &dyn Fn() -> bool) -> Result<GoalReply, SchedulerError> {
+        Err(SchedulerError::Unsupported("not for actors".into()))
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, AssignError> {
+    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
         let n = request.agent_count as u32;
         // The version is read again and again: a torn one would show.
         let goals = (0..n).map(|agent| Some((agent + self.0) % n)).collect();
@@ -28,8 +28,8 @@ impl Scheduler for Numbered {
     }
 }
 
-fn load_numbered(bytes: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, AssignError> {
-    let bytes = bytes.try_into().map_err(|_| AssignError::Failed("four bytes are needed".into()))?;
+fn load_numbered(bytes: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
+    let bytes = bytes.try_into().map_err(|_| SchedulerError::Load("four bytes are needed".into()))?;
     Ok(Arc::new(Numbered(u32::from_le_bytes(bytes))))
 }
 
@@ -42,7 +42,7 @@ fn octet() -> v1::AssignRequest {
 
 /// The one version that an answer shows in everything it says.
 fn version(reply: &v1::AssignResponse) -> u32 {
-    assert_eq!(reply.scheduler(), v1::SchedulerKind::Learned, "{}", reply.fallback_reason);
+    assert_eq!(reply.scheduler(), v1::AssignmentMethod::Learned, "{}", reply.fallback_reason);
     for pair in &reply.pairs {
         assert_eq!(pair.goal_index, (pair.agent_index + reply.version) % 8, "version {}", reply.version);
         assert_eq!(pair.probability, Some(reply.version as f32 / 1_048_576.0));
@@ -55,7 +55,7 @@ fn version(reply: &v1::AssignResponse) -> u32 {
 async fn a_thousand_swaps_under_load_and_every_answer_is_of_one_version() {
     let mut learner = Learner::start().await;
     learner.collector.publish(&weights(1)).unwrap();
-    let config = CommanderConfig { learner_url: Some(learner.url.clone()), ..CommanderConfig::default() };
+    let config = ServiceConfig { learner_url: Some(learner.url.clone()), ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_numbered).await;
     let mut client = commander_client(&commander.url).await;
     within(async { while !client.get_model(v1::GetModelRequest {}).await.unwrap().into_inner().ready {} }).await;
@@ -94,7 +94,7 @@ async fn a_thousand_swaps_under_load_and_every_answer_is_of_one_version() {
 async fn a_file_that_is_replaced_is_the_next_version_and_a_broken_one_is_not() {
     let folder = run_folder(&0u32.to_le_bytes());
     let file = WeightsFile::find(folder.path(), None).unwrap();
-    let config = CommanderConfig { weights: Some(file), ..CommanderConfig::default() };
+    let config = ServiceConfig { weights: Some(file), ..ServiceConfig::default() };
     let commander = Commander::start_with("127.0.0.1:0", config, load_numbered).await;
     let mut client = commander_client(&commander.url).await;
     assert_eq!(version(client.assign(octet()).await.unwrap().get_ref()), 0);

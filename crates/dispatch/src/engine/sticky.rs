@@ -1,51 +1,51 @@
-//! Reluctance: pairs that are in force are made cheaper, and a wish that knows nothing of them is followed only where it
-//! is worth the switches.
+//! Switching costs: current pairs are made cheaper, and a preferred matching that ignores them is followed only where it saves
+//! more than the switches cost.
 
 use super::pairs;
 use crate::UNASSIGNED;
 use magex_assign::{AssignError, Solver};
 
-/// Part of a pair's own cost that leaving it must gain at least: more than the rounding of sums.
+/// Minimum gain of leaving a pair, relative to its own cost: more than the rounding of sums.
 const WORTH: f64 = 1e-9;
 
-/// Makes the costs of the pairs in force smaller by the switching cost, and by enough that they win a tie. Each by its
-/// own size: a pair that is far away or dear says nothing about what the others are worth.
+/// Reduces the costs of the current pairs by the switching cost, or by enough to win a tie. The tie margin is relative to each
+/// pair's own cost, so that one expensive pair does not affect the others.
 pub(super) fn favour(adjusted: &mut [f64], cols: usize, current: &[u32], switching_cost: f64) {
     let smallest = smallest(adjusted);
     for (agent, goal) in pairs(current) {
         let row = &adjusted[agent * cols..(agent + 1) * cols];
         let cost = row[goal];
-        // Forbidden now.
+        // The pair is forbidden now.
         if cost == f64::INFINITY {
             continue;
         }
-        // What costs nothing is measured by the least that something costs, for this agent or for anybody.
+        // The scale of a pair of cost 0 is the smallest non-zero cost of its agent, or else of the problem.
         let scale = if cost != 0.0 { cost.abs() } else { self::smallest(row).or(smallest).unwrap_or(1.0) };
         adjusted[agent * cols + goal] = cost - switching_cost.max(WORTH * scale);
     }
 }
 
-/// The smallest cost that is not nothing.
+/// The smallest non-zero magnitude.
 fn smallest(costs: &[f64]) -> Option<f64> {
     let sizes = costs.iter().filter(|cost| cost.is_finite() && **cost != 0.0).map(|cost| cost.abs());
     sizes.min_by(f64::total_cmp)
 }
 
-/// Follows `wish`, as full a matching as there can be, only where it is worth leaving the pairs in force.
+/// Follows `wish`, a maximum matching, only where it saves more than leaving the current pairs costs.
 ///
-/// What is compared with it keeps all pairs in force that are still possible, gives the other agents what the wish gives
-/// them where that is free, and the rest to the exact solver. The two differ in groups that share no agent and no goal:
-/// an exchange, or a row of agents each of whom takes the next one's goal. Every group is decided by itself, by the
-/// `adjusted` costs, and agents of other groups stay out of it. More pairs always win.
+/// The alternative keeps all current pairs that are still allowed, gives the other agents their goal in `wish` if it is free, and
+/// assigns the rest with the exact solver. The two matchings differ in groups that share no agent and no goal: an exchange, or a
+/// chain of agents that each take the next one's goal. Every group is decided separately, by the `adjusted` costs. The matching
+/// with more pairs always wins.
 pub(super) fn follow(
     wish: &[u32],
     adjusted: &[f64],
     cols: usize,
     current: &[u32],
     solver: &mut Solver,
-    go_on: &dyn Fn() -> bool,
+    should_continue: &dyn Fn() -> bool,
 ) -> Result<Vec<u32>, AssignError> {
-    let kept = keep(wish, adjusted, cols, current, solver, go_on)?;
+    let kept = keep(wish, adjusted, cols, current, solver, should_continue)?;
     let rows = wish.len();
     let mut groups = Groups::new(rows + cols);
     let apart: Vec<usize> = (0..rows).filter(|&agent| kept[agent] != wish[agent]).collect();
@@ -54,7 +54,7 @@ pub(super) fn follow(
             groups.join(agent, rows + goal as usize);
         }
     }
-    // Of each group: how many more pairs the wish has, and how much more they cost.
+    // Per group: additional pairs of the wish, and their additional cost.
     let mut more = vec![(0i64, 0.0f64); rows + cols];
     for &agent in &apart {
         let (pairs, cost) = &mut more[groups.of(agent)];
@@ -76,14 +76,14 @@ pub(super) fn follow(
     Ok(followed)
 }
 
-/// The pairs in force, and for everybody else what the wish has for them or the best of what is left.
+/// The current pairs; for the other agents their goal in `wish`, or the best of the remaining goals.
 fn keep(
     wish: &[u32],
     adjusted: &[f64],
     cols: usize,
     current: &[u32],
     solver: &mut Solver,
-    go_on: &dyn Fn() -> bool,
+    should_continue: &dyn Fn() -> bool,
 ) -> Result<Vec<u32>, AssignError> {
     let (mut kept, mut free) = (vec![UNASSIGNED; wish.len()], vec![true; cols]);
     for (agent, goal) in pairs(current) {
@@ -103,14 +103,14 @@ fn keep(
     }
     let rest: Vec<f64> =
         agents.iter().flat_map(|agent| goals.iter().map(move |goal| adjusted[agent * cols + goal])).collect();
-    let filled = solver.solve_allowed(&rest, agents.len(), goals.len(), go_on)?;
+    let filled = solver.solve_allowed(&rest, agents.len(), goals.len(), should_continue)?;
     for (row, col) in filled.pairs() {
         kept[agents[row]] = goals[col] as u32;
     }
     Ok(kept)
 }
 
-/// Which agents and goals belong together.
+/// Disjoint sets of agents and goals.
 struct Groups(Vec<usize>);
 
 impl Groups {

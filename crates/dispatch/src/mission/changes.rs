@@ -1,4 +1,4 @@
-//! Why an agent's goal changed, as a sentence.
+//! The reason of a changed goal, as a sentence.
 
 use magex_proto::v1;
 
@@ -11,27 +11,29 @@ pub(super) fn sentence(
     switching_cost: f64,
 ) -> String {
     let (from, then) =
-        (from.unwrap_or_default(), to.map_or_else(|| "no goal is left for it".into(), |to| format!("{to} is next")));
+        (from.unwrap_or_default(), to.map_or_else(|| "it has no goal now".into(), |to| format!("it gets {to}")));
     match reason {
-        v1::ChangeReason::Assigned => format!("{agent} had no goal and takes {}", to.unwrap_or_default()),
+        v1::ChangeReason::Assigned => format!("{agent} had no goal and gets {}", to.unwrap_or_default()),
         v1::ChangeReason::Switched => match saving {
             Some(saving) => format!(
-                "{agent} leaves {from} for {}: the team saves {saving:.4}, more than the switching cost of {switching_cost} each",
+                "{agent} switches from {from} to {}: the team saves {saving:.4}, more than the switching cost of {switching_cost} per agent",
                 to.unwrap_or_default()
             ),
             None => format!(
-                "{agent} leaves {from} for {}: the team as it is now is served better, by more than the switching cost of {switching_cost} each",
+                "{agent} switches from {from} to {}: the changed team saves more than the switching cost of {switching_cost} per agent",
                 to.unwrap_or_default()
             ),
         },
-        v1::ChangeReason::AgentFailed => format!("{agent} failed and gives up {from}"),
-        v1::ChangeReason::AgentFinished => format!("{agent} has finished and gives up {from}"),
-        v1::ChangeReason::AgentRemoved => format!("{agent} was removed and gives up {from}"),
-        v1::ChangeReason::GoalFailed => format!("{from} failed; {then}"),
-        v1::ChangeReason::GoalFinished => format!("{from} is finished; {then}"),
-        v1::ChangeReason::GoalRemoved => format!("{from} was removed; {then}"),
-        v1::ChangeReason::PairForbidden => format!("{agent} must not go to {from} any more; {then}"),
-        v1::ChangeReason::Displaced => format!("{from} serves the team better with another agent; {then}"),
+        v1::ChangeReason::AgentFailed => format!("{agent} failed and loses {from}"),
+        v1::ChangeReason::AgentFinished => format!("{agent} finished and loses {from}"),
+        v1::ChangeReason::AgentRemoved => format!("{agent} was removed and loses {from}"),
+        v1::ChangeReason::GoalFailed => format!("{from}, the goal of {agent}, failed; {then}"),
+        v1::ChangeReason::GoalFinished => format!("{from}, the goal of {agent}, is finished; {then}"),
+        v1::ChangeReason::GoalRemoved => format!("{from}, the goal of {agent}, was removed; {then}"),
+        v1::ChangeReason::PairForbidden => format!("the pair of {agent} and {from} is forbidden now; {then}"),
+        v1::ChangeReason::Displaced => {
+            format!("another agent gets {from}, the goal of {agent}, at a lower cost of the team; {then}")
+        }
         v1::ChangeReason::Unspecified => String::new(),
     }
 }

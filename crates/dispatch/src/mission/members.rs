@@ -1,46 +1,49 @@
-//! Members and settings of a mission, as requests bring them.
+//! Checks the members and settings of a mission in requests and records.
 
 use super::{MissionLimits, Names, TRAINING_PREFIX};
 use crate::DispatchError;
 use crate::problem::{LONGEST_ID, finite_cost, scheduler, switching_cost};
 use magex_proto::convert::ConvertError;
-use magex_proto::goals::SchedulerKind;
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use std::collections::{BTreeSet, HashMap, HashSet};
 
-/// Most pairs that a mission forbids, or prices, and longest list in a request.
+/// Maximum number of forbidden pairs, of cost overrides, and of entries of a list in a request.
 pub(super) fn most_pairs(limits: &MissionLimits) -> usize {
     limits.members.saturating_mul(10)
 }
 
-/// Refuses lists that nobody needs before anything goes through them.
+/// Rejects oversized lists before they are processed.
 pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), DispatchError> {
     let most = most_pairs(limits);
     match lists.iter().find(|(_, count)| *count > most) {
-        Some((field, count)) => {
-            Err(DispatchError::invalid(*field, format!("{count} entries are more than {most}; send fewer at a time")))
-        }
+        Some((field, count)) => Err(DispatchError::invalid(
+            *field,
+            format!("{count} entries exceed the limit of {most}; send fewer at a time"),
+        )),
         None => Ok(()),
     }
 }
 
 /// The names of a mission's members.
-pub(super) struct Known<'a> {
+pub(super) struct MemberNames<'a> {
     agents: HashSet<&'a str>,
     goals: HashSet<&'a str>,
 }
 
-impl<'a> Known<'a> {
+impl<'a> MemberNames<'a> {
     pub(super) fn of(assignment: &'a v1::Assignment) -> Self {
         let ids = |members: &'a [v1::Member]| members.iter().map(|member| member.id.as_str()).collect();
         Self { agents: ids(&assignment.agents), goals: ids(&assignment.goals) }
     }
 
-    /// A mission's members come and go: only names mean anything.
+    /// Resolves a pair by name: indices change when members are removed.
     pub(super) fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
         let known = |field: &str, members: &HashSet<&str>, id: &str| match members.contains(id) {
             true => Ok(()),
-            false if id.is_empty() => Err(ConvertError::new(field, "missing; missions name pairs by id, not by index")),
+            false if id.is_empty() => {
+                Err(ConvertError::new(field, "missing; pairs of a mission are named by id, not by index"))
+            }
             false => Err(ConvertError::new(field, "no member has this name")),
         };
         known("agent_id", &self.agents, &pair.agent_id)?;
@@ -49,7 +52,7 @@ impl<'a> Known<'a> {
     }
 }
 
-/// Adds new members, and changes those that are there.
+/// Adds new members and updates existing ones.
 pub(super) fn merge(
     field: &str,
     members: &mut Vec<v1::Member>,
@@ -65,10 +68,10 @@ pub(super) fn merge(
             return wrong("id", format!("{} bytes; a name has 1 to {LONGEST_ID}", update.id.len()));
         }
         if !seen.insert(update.id.clone()) {
-            return wrong("id", "the same name occurs before".to_owned());
+            return wrong("id", "duplicate name".to_owned());
         }
         let Ok(state) = v1::MemberState::try_from(update.state) else {
-            return wrong("state", format!("{} is unknown", update.state));
+            return wrong("state", format!("{} is not a state; use active, failed or finished", update.state));
         };
         if let Some(axis) = update.position.iter().position(|x| !x.is_finite()) {
             return wrong(&format!("position[{axis}]"), format!("{} is not finite", update.position[axis]));
@@ -76,10 +79,13 @@ pub(super) fn merge(
         let known = places.get(&update.id).copied();
         if !(known.is_some() && update.position.is_empty()) {
             if !(2..=3).contains(&update.position.len()) {
-                return wrong("position", format!("{} coordinates are not 2 or 3", update.position.len()));
+                return wrong("position", format!("{} coordinates; give 2 or 3", update.position.len()));
             }
             if update.position.len() != dims {
-                return wrong("position", format!("{} coordinates, others have {dims}", update.position.len()));
+                return wrong(
+                    "position",
+                    format!("{} coordinates, but other members have {dims}", update.position.len()),
+                );
             }
         }
         match known {
@@ -105,12 +111,12 @@ pub(super) fn merge(
     Ok(())
 }
 
-pub(super) fn sticky_scheduler(value: i32) -> Result<Option<SchedulerKind>, DispatchError> {
+pub(super) fn sticky_scheduler(value: i32) -> Result<Option<AssignmentMethod>, DispatchError> {
     let kind = scheduler("scheduler", value)?;
-    if kind == Some(SchedulerKind::Random) {
+    if kind == Some(AssignmentMethod::Random) {
         return Err(DispatchError::invalid(
             "scheduler",
-            "a mission cannot be random; use exact, makespan, greedy or learned",
+            "random is not allowed for a mission; use exact, makespan, greedy or learned",
         ));
     }
     Ok(kind)
@@ -122,7 +128,7 @@ pub(super) fn check_id(id: &str) -> Result<(), DispatchError> {
         return Ok(());
     }
     let problem =
-        format!("a name has up to {LONGEST_ID} of A-Z a-z 0-9 . _ - and does not begin with '{TRAINING_PREFIX}'");
+        format!("use 1 to {LONGEST_ID} characters of A-Z a-z 0-9 . _ -, not starting with '{TRAINING_PREFIX}'");
     Err(DispatchError::invalid("mission_id", problem))
 }
 
@@ -132,28 +138,31 @@ pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i
     if seconds > 0.0 && seconds <= most {
         return Ok(((seconds * 1e3) as i64).max(1));
     }
-    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is not above 0 and up to {most}")))
+    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is outside 0..={most}; give a positive number")))
 }
 
-/// Refuses a record that no mission can have written: what goes on from it takes for granted what requests are checked for.
+/// Checks a record by the rules of requests, on which updates rely.
 pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Result<(), ConvertError> {
     let wrong = |field: String, problem: &str| Err(ConvertError::new(field, problem.to_owned()));
     check_id(&a.mission_id).map_err(|error| ConvertError::new("mission_id", error.to_string()))?;
     sticky_scheduler(a.scheduler).map_err(|error| ConvertError::new("scheduler", error.to_string()))?;
     switching_cost(a.switching_cost)?;
     if a.revision == u64::MAX {
-        return wrong("revision".to_owned(), "there is none after it");
+        return wrong("revision".to_owned(), "u64::MAX cannot be incremented");
     }
     let dims = a.agents.iter().chain(&a.goals).map(|member| member.position.len()).next().unwrap_or(2);
     for (field, members) in [("agents", &a.agents), ("goals", &a.goals)] {
         let mut seen = HashSet::new();
         for (k, member) in members.iter().enumerate() {
             if member.id.is_empty() || !seen.insert(member.id.as_str()) {
-                return wrong(format!("{field}[{k}].id"), "empty, or the same name occurs before");
+                return wrong(format!("{field}[{k}].id"), "empty or duplicate name");
             }
             let position = &member.position;
             if position.len() != dims || !(2..=3).contains(&dims) || position.iter().any(|x| !x.is_finite()) {
-                return wrong(format!("{field}[{k}].position"), "not as many finite coordinates as others have");
+                return wrong(
+                    format!("{field}[{k}].position"),
+                    "coordinates are not finite, or their number differs from other members",
+                );
             }
             if !v1::MemberState::try_from(member.state).is_ok_and(|state| state != v1::MemberState::Unspecified) {
                 return wrong(format!("{field}[{k}].state"), "unknown");
@@ -163,7 +172,7 @@ pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Re
     let (mut agents, mut goals) = (HashSet::new(), HashSet::new());
     for (k, pair) in a.pairs.iter().enumerate() {
         if !agents.insert(pair.agent_id.as_str()) || !goals.insert(pair.goal_id.as_str()) {
-            return wrong(format!("pairs[{k}]"), "its agent or its goal is in another pair");
+            return wrong(format!("pairs[{k}]"), "its agent or goal is in another pair");
         }
     }
     for (k, item) in overrides.iter().enumerate() {

@@ -201,24 +201,24 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
     }));
 }
 
-fn scheduler(kind: Kind) -> v1::SchedulerKind {
+fn scheduler(kind: Kind) -> v1::AssignmentMethod {
     match kind {
-        Kind::Learned => v1::SchedulerKind::Learned,
-        Kind::Exact => v1::SchedulerKind::Exact,
-        Kind::Greedy => v1::SchedulerKind::Greedy,
-        Kind::Random => v1::SchedulerKind::Random,
-        Kind::Makespan => v1::SchedulerKind::ExactMakespan,
+        Kind::Learned => v1::AssignmentMethod::Learned,
+        Kind::Exact => v1::AssignmentMethod::Exact,
+        Kind::Greedy => v1::AssignmentMethod::Greedy,
+        Kind::Random => v1::AssignmentMethod::Random,
+        Kind::Makespan => v1::AssignmentMethod::Makespan,
     }
 }
 
-fn kind_name(kind: v1::SchedulerKind) -> &'static str {
+fn kind_name(kind: v1::AssignmentMethod) -> &'static str {
     match kind {
-        v1::SchedulerKind::Learned => "learned",
-        v1::SchedulerKind::Exact => "exact",
-        v1::SchedulerKind::Greedy => "greedy",
-        v1::SchedulerKind::Random => "random",
-        v1::SchedulerKind::ExactMakespan => "makespan",
-        v1::SchedulerKind::Unspecified => "unknown",
+        v1::AssignmentMethod::Learned => "learned",
+        v1::AssignmentMethod::Exact => "exact",
+        v1::AssignmentMethod::Greedy => "greedy",
+        v1::AssignmentMethod::Random => "random",
+        v1::AssignmentMethod::Makespan => "makespan",
+        v1::AssignmentMethod::Unspecified => "unknown",
     }
 }
 

@@ -1,4 +1,4 @@
-//! Asking a service whether it is well: for orchestrators, from inside its container, without further programs.
+//! Health check of a service, for orchestrators that run it inside the service's container.
 
 use crate::client::{UrlError, endpoint_with};
 use crate::exit::{self, Failure};
@@ -11,53 +11,53 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-/// A service that does not answer within this time is not well, unless told otherwise.
+/// Default timeout of a health check.
 pub const DEADLINE: Duration = Duration::from_secs(2);
 
-/// Longest answer of a page that is read.
+/// Bytes that are read of a page.
 const PAGE: u64 = 4096;
 
-/// Why a service is not well.
+/// Why a service is unhealthy.
 #[derive(Debug, thiserror::Error)]
 pub enum Unhealthy {
-    /// The address makes no sense.
+    /// The URL is malformed.
     #[error(transparent)]
     Url(#[from] UrlError),
-    /// The certificates that the environment names.
+    /// The certificates of the environment are unusable.
     #[error("{0}")]
     Tls(#[from] TlsError),
-    /// Nobody is there, or nobody who understands the question.
+    /// No connection, or no health service.
     #[error("{url}: {reason}")]
     Unreachable {
-        /// Who was asked.
+        /// The URL.
         url: String,
-        /// What went wrong.
+        /// The reason.
         reason: String,
     },
-    /// It says so itself.
-    #[error("{url} says {status}")]
+    /// It reports another status.
+    #[error("{url} reports {status}")]
     NotServing {
-        /// Who was asked.
+        /// The URL.
         url: String,
-        /// What it said.
+        /// The status.
         status: String,
     },
-    /// It does not answer.
+    /// It does not answer in time.
     #[error("{url} did not answer within {} s", .deadline.as_secs_f64())]
     Late {
-        /// Who was asked.
+        /// The URL.
         url: String,
-        /// How long it was waited for.
+        /// The timeout.
         deadline: Duration,
     },
 }
 
-/// Asks the service at `url` once. A url without a path is asked over gRPC (grpc.health.v1) about `service`, which may be
-/// empty for the whole process; https takes the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY`
-/// name. A url with a path is a page, http://host:port/healthz, that must answer 200.
+/// Checks the service at `url` once. A URL without a path is checked over gRPC (grpc.health.v1) for `service`, or for the whole
+/// process if that is empty; https uses the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` name. A URL
+/// with a path is a page, such as http://host:port/healthz, that must answer 200.
 ///
 /// # Errors
-/// It is not well.
+/// The service is unhealthy.
 pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Unhealthy> {
     let asking = async {
         match page_of(url) {
@@ -69,10 +69,10 @@ pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Unh
     tokio::time::timeout(deadline, asking).await.map_err(late)?
 }
 
-/// [`ask`] on a runtime of its own. The exit code, or what is wrong.
+/// [`ask`] on its own runtime. Returns the exit code.
 ///
 /// # Errors
-/// Wrong usage, or the service is not well.
+/// Wrong usage, or the service is unhealthy.
 pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -84,7 +84,7 @@ pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> 
     })
 }
 
-/// Asks the service of this machine that was started with these options.
+/// Checks the service that was started on this machine with these options.
 ///
 /// # Errors
 /// As [`run`].
@@ -93,19 +93,18 @@ pub fn own(listen: &str, secure: bool) -> Result<u8, Failure> {
     run(&format!("{scheme}://{}", reachable(listen)), "", DEADLINE)
 }
 
-/// Asks for the page of the program of this machine that was started with these options.
+/// Checks the HTTP server of the program that was started on this machine with these options.
 ///
 /// # Errors
-/// As [`run`]; no address is wrong usage.
+/// As [`run`]; a missing address is wrong usage.
 pub fn own_page(listen: Option<&str>) -> Result<u8, Failure> {
     let listen = listen.ok_or_else(|| {
-        Failure::usage("--health-check asks for the page at --http (MAGEX_HTTP), and there is no such address; set it")
+        Failure::usage("--health-check: needs the address of the HTTP server; set --http or MAGEX_HTTP")
     })?;
     run(&format!("http://{}/healthz", reachable(listen)), "", DEADLINE)
 }
 
-/// Where a listener is reached from its own machine. The name of every loopback address is localhost: certificates have
-/// names.
+/// The address of a listener from its own machine. Loopback addresses become `localhost`, because certificates contain names.
 fn reachable(listen: &str) -> String {
     let (host, port) = listen.rsplit_once(':').unwrap_or((listen, ""));
     let address = host.trim_start_matches('[').trim_end_matches(']').parse::<std::net::IpAddr>();
@@ -117,7 +116,7 @@ fn reachable(listen: &str) -> String {
     }
 }
 
-/// Host with port, and path, of a url that names a page.
+/// Host with port, and path, of a URL with a path.
 fn page_of(url: &str) -> Option<(&str, &str)> {
     let rest = url.strip_prefix("http://")?;
     let slash = rest.find('/')?;
@@ -133,7 +132,7 @@ async fn ask_grpc(url: &str, service: &str) -> Result<(), Unhealthy> {
     let channel = endpoint.connect().await.map_err(|error| unreachable(root_of(&error)))?;
     let request = HealthCheckRequest { service: service.to_owned() };
     let answer = HealthClient::new(channel).check(request).await.map_err(|status| match status.code() {
-        Code::NotFound => unreachable(format!("there is no service '{service}'")),
+        Code::NotFound => unreachable(format!("no service '{service}'")),
         code => unreachable(format!("{code:?}: {}", status.message())),
     })?;
     let status = answer.into_inner().status();
@@ -143,7 +142,7 @@ async fn ask_grpc(url: &str, service: &str) -> Result<(), Unhealthy> {
     Err(Unhealthy::NotServing { url: url.to_owned(), status: status.as_str_name().to_owned() })
 }
 
-/// What went wrong in the end: the layers above only say that something did.
+/// The innermost error: the outer ones carry no detail.
 fn root_of(error: &dyn std::error::Error) -> String {
     let mut root = error;
     while let Some(source) = root.source() {
@@ -183,18 +182,18 @@ mod tests {
     const SOON: Duration = Duration::from_secs(5);
 
     #[tokio::test]
-    async fn a_service_is_well_from_when_it_says_so_until_it_says_otherwise() {
+    async fn health_follows_the_reported_status() {
         let (incoming, address) = server::bind("127.0.0.1:0").await.unwrap();
         let (health, service) = Health::new::<Named>().await;
         let stop = CancellationToken::new();
         let router = server::builder().add_service(service);
         let serving = tokio::spawn(server::serve(router, incoming, stop.clone(), Duration::ZERO));
         let url = format!("http://{address}");
-        for (well, service) in [(false, ""), (true, ""), (true, "test.Named"), (false, "test.Named")] {
-            health.set(well).await;
+        for (healthy, service) in [(false, ""), (true, ""), (true, "test.Named"), (false, "test.Named")] {
+            health.set(healthy).await;
             let answer = ask(&url, service, SOON).await;
-            assert_eq!(answer.is_ok(), well, "{answer:?}");
-            assert!(well || answer.unwrap_err().to_string().contains("NOT_SERVING"));
+            assert_eq!(answer.is_ok(), healthy, "{answer:?}");
+            assert!(healthy || answer.unwrap_err().to_string().contains("NOT_SERVING"));
         }
         let error = ask(&url, "test.Other", SOON).await.unwrap_err().to_string();
         assert!(error.contains("no service 'test.Other'"), "{error}");
@@ -218,7 +217,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_says_nothing_is_not_waited_for() {
+    async fn a_silent_service_times_out() {
         let mute = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = mute.local_addr().unwrap();
         for url in [format!("http://{address}"), format!("http://{address}/healthz")] {
@@ -228,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_listener_is_reached_by_name_from_its_own_machine() {
+    fn loopback_listeners_are_reached_by_name() {
         let cases = [
             ("0.0.0.0:7000", "localhost:7000"),
             ("[::]:7000", "localhost:7000"),

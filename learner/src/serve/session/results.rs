@@ -57,7 +57,7 @@ impl Session {
         let Some(part) = message.part else {
             return Err(SessionEnd::Refused(status::invalid_argument("part", "missing")));
         };
-        self.shared.metrics.received_bytes.add(part.data.len() as u64);
+        self.shared.metrics.received_bytes.inc_by(part.data.len() as u64);
         if part.index == 0 {
             self.assembling = Some(lease);
         } else if self.assembling != Some(lease) {

@@ -184,7 +184,7 @@ fn quality_rows(report: &mut Report, args: &AssignArgs, weights: &[u8], config: 
     Ok(())
 }
 
-fn team(n: usize, index: u32, scheduler: v1::SchedulerKind) -> v1::AssignRequest {
+fn team(n: usize, index: u32, scheduler: v1::AssignmentMethod) -> v1::AssignRequest {
     let (agents, goals) = uniform_points(n, index);
     let points = |coordinates| Some(v1::Positions { dims: 2, coordinates, array: None });
     let scheduler = scheduler.into();
@@ -197,8 +197,8 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     let many = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let service = ServiceProcess::start(Some(folder)).context("the commander")?;
     for (kind, name, must, aim) in [
-        (v1::SchedulerKind::Exact, "EXACT_TOTAL", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
-        (v1::SchedulerKind::Learned, "LEARNED", ["2 / 8 ms", "800/s"], ["0.6 / 2 ms", "4,000/s"]),
+        (v1::AssignmentMethod::Exact, "EXACT_TOTAL", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
+        (v1::AssignmentMethod::Learned, "LEARNED", ["2 / 8 ms", "800/s"], ["0.6 / 2 ms", "4,000/s"]),
     ] {
         let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, kind)).collect();
         let [p50, p99, inside] = one.block_on(one_client(&service.url, &teams, args.calls, kind))?;
@@ -209,7 +209,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
         let what = format!("Assign {name}, {TEAM} × {TEAM}, at saturation");
         row(report, &what, format!("{}/s", thousands(rate)), must[1], aim[1], json!({ "calls_per_s": rate }));
     }
-    let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, v1::SchedulerKind::Exact)).collect();
+    let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, v1::AssignmentMethod::Exact)).collect();
     let Flood { answered, exhausted, wrong, health_p99, memory } =
         many.block_on(flood(&service, &teams, args.flood))?;
     let [begin, middle, end] = memory;
@@ -227,7 +227,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     drop(service);
     let service = ServiceProcess::start(None).context("the commander")?;
     for (kind, name) in
-        [(v1::SchedulerKind::Exact, "EXACT_TOTAL"), (v1::SchedulerKind::ExactMakespan, "EXACT_MAKESPAN")]
+        [(v1::AssignmentMethod::Exact, "EXACT_TOTAL"), (v1::AssignmentMethod::Makespan, "EXACT_MAKESPAN")]
     {
         let [seconds, ..] = one.block_on(one_client(&service.url, &[team(5000, 0, kind)], 1, kind))?;
         let (seconds, peak) = (seconds / 1e3, service.peak_mib());

@@ -35,7 +35,7 @@ pub(super) async fn one_client(
     url: &str,
     teams: &[v1::AssignRequest],
     calls: u32,
-    kind: v1::SchedulerKind,
+    kind: v1::AssignmentMethod,
 ) -> anyhow::Result<[f64; 3]> {
     let mut client = connect(url).await?;
     let (mut times, mut inside) = (Vec::new(), Vec::new());
@@ -61,7 +61,7 @@ pub(super) async fn saturate(
     url: &str,
     teams: &[v1::AssignRequest],
     seconds: u32,
-    kind: v1::SchedulerKind,
+    kind: v1::AssignmentMethod,
 ) -> anyhow::Result<f64> {
     let start = Instant::now();
     let until = start + Duration::from_secs(seconds.into());

@@ -1,11 +1,11 @@
 use super::*;
-use crate::admission::FlightLimits;
+use crate::net::in_flight::InFlightLimits;
 use http_body::Body as _;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::codegen::Bytes;
 
-/// A body of whatever is sent to it.
+/// A body of the chunks that are sent to it.
 struct Chunks(mpsc::UnboundedReceiver<Bytes>);
 
 impl http_body::Body for Chunks {
@@ -17,12 +17,12 @@ impl http_body::Body for Chunks {
     }
 }
 
-fn metered(kind: Kind, strict: bool) -> (mpsc::UnboundedSender<Bytes>, Metered) {
-    let limits = FlightLimits { calls: 1, streams: 1, caller_bytes: 1 << 20, bytes: 1 << 20 };
-    let admission = Admission::new(limits, CancellationToken::new());
-    let slot = admission.enter(&Caller { name: "a".into(), role: Role::Client }, kind).unwrap();
+fn metered(kind: CallKind, strict: bool) -> (mpsc::UnboundedSender<Bytes>, Metered) {
+    let limits = InFlightLimits { calls: 1, streams: 1, caller_bytes: 1 << 20, bytes: 1 << 20 };
+    let in_flight = InFlight::new(limits, CancellationToken::new());
+    let permit = in_flight.acquire(&Caller { name: "a".into(), role: Role::Client }, kind).unwrap();
     let (chunks, receiver) = mpsc::unbounded_channel();
-    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(slot), kind, 100, strict))
+    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(permit), kind, Limit { bytes: 100, strict }))
 }
 
 async fn next(body: &mut Metered) -> Option<Result<Frame<Bytes>, Status>> {
@@ -34,48 +34,48 @@ fn message(length: u8) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn every_message_of_a_stream_has_its_own_time() {
-    let (_chunks, mut body) = metered(Kind::Stream, false);
-    let begin = |body: &mut Metered| body.patience = Some(Box::pin(tokio::time::sleep(MESSAGE)));
+async fn every_message_of_a_stream_has_its_own_timeout() {
+    let (_chunks, mut body) = metered(CallKind::Stream, false);
+    let begin = |body: &mut Metered| body.timeout = Some(Box::pin(tokio::time::sleep(MESSAGE)));
     let (first, second) = (message(8), message(8));
     body.count(&first[..9]).unwrap();
-    assert!(body.begun);
+    assert!(body.timed);
     begin(&mut body);
     body.count(&first[9..11]).unwrap();
-    assert!(body.begun && body.patience.is_some(), "more of the same message brings no more time");
-    // Never a silence between two messages.
+    assert!(body.timed && body.timeout.is_some(), "more of the same message does not extend the timeout");
+    // The next message begins at once.
     body.count(&[&first[11..], &second[..9]].concat()).unwrap();
-    assert!(body.begun && body.patience.is_none());
+    assert!(body.timed && body.timeout.is_none());
     begin(&mut body);
     body.count(&[&second[9..], &message(0)[..], &message(0)[..3]].concat()).unwrap();
-    assert!(body.begun && body.patience.is_none());
+    assert!(body.timed && body.timeout.is_none());
     begin(&mut body);
     body.count(&message(0)[3..]).unwrap();
-    assert!(!body.begun && body.patience.is_none(), "a stream may be silent between messages");
+    assert!(!body.timed && body.timeout.is_none(), "a stream may be silent between messages");
 }
 
 #[tokio::test]
-async fn whoever_begins_a_message_and_does_not_end_it_is_left() {
-    for kind in [Kind::Stream, Kind::Call] {
+async fn an_unfinished_message_times_out() {
+    for kind in [CallKind::Stream, CallKind::Call] {
         let (chunks, mut body) = metered(kind, false);
         chunks.send(Bytes::copy_from_slice(&message(8)[..9])).unwrap();
         next(&mut body).await.unwrap().unwrap();
-        body.patience = Some(Box::pin(tokio::time::sleep(std::time::Duration::from_millis(20))));
+        body.timeout = Some(Box::pin(tokio::time::sleep(std::time::Duration::from_millis(20))));
         let error = next(&mut body).await.unwrap().unwrap_err();
         assert_eq!(error.code(), tonic::Code::DeadlineExceeded, "{error}");
     }
 }
 
 #[tokio::test]
-async fn guests_send_short_messages_only() {
+async fn anonymous_callers_send_short_messages_only() {
     for (strict, refused) in [(true, true), (false, false)] {
-        let (chunks, mut body) = metered(Kind::Call, strict);
+        let (chunks, mut body) = metered(CallKind::Call, strict);
         chunks.send(message(101).into()).unwrap();
         assert_eq!(next(&mut body).await.unwrap().is_err(), refused);
     }
 }
 
-/// Says nothing, ever.
+/// Never answers.
 #[derive(Clone)]
 struct Mute;
 
@@ -94,12 +94,12 @@ impl Service<http::Request<Body>> for Mute {
 }
 
 #[tokio::test]
-async fn guests_hold_a_bounded_number_of_calls() {
+async fn anonymous_callers_hold_a_bounded_number_of_calls() {
     let (incoming, _) = crate::server::bind("127.0.0.1:0").await.unwrap();
-    let mut open = Open::new(Mute, incoming.connections());
+    let mut public = Guard::public(Mute, incoming.connections());
     let mut held = Vec::new();
     let refused = loop {
-        let mut answer = open.call(http::Request::builder().uri("/s/Watch").body(Body::empty()).unwrap());
+        let mut answer = public.call(http::Request::builder().uri("/s/Watch").body(Body::empty()).unwrap());
         match std::future::poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
             Poll::Pending => held.push(answer),
             Poll::Ready(Ok(response)) => break Status::from_header_map(response.headers()).unwrap(),
@@ -108,7 +108,7 @@ async fn guests_hold_a_bounded_number_of_calls() {
         assert!(held.len() < 10_000);
     };
     assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
-    // Calls have places of their own.
-    let mut other = open.call(http::Request::builder().uri("/s/Check").body(Body::empty()).unwrap());
+    // Unary calls have a limit of their own.
+    let mut other = public.call(http::Request::builder().uri("/s/Check").body(Body::empty()).unwrap());
     assert!(std::future::poll_fn(|cx| Poll::Ready(other.as_mut().poll(cx))).await.is_pending());
 }

@@ -1,19 +1,19 @@
-//! What went wrong, in headers that every client accepts: many refuse a list of headers longer than 8 or 16 KiB, and see an
-//! internal error in the place of ours.
+//! Keeps error statuses within the header sizes that clients accept: many reject a header list over 8 or 16 KiB and report
+//! an internal error instead of ours.
 
 use tonic::codegen::http::{HeaderMap, HeaderValue};
 
 /// Longest `grpc-message`, bytes as sent (percent-encoded).
 const MESSAGE: usize = 2048;
 
-/// Longest details, bytes as sent. They repeat the message; the field's path is short unless a caller made it long.
+/// Longest `grpc-status-details-bin`, bytes as sent. The details repeat the message.
 const DETAILS: usize = 4096;
 
 /// `…`, percent-encoded.
 const MORE: &[u8] = b"%E2%80%A6";
 
-/// Cuts a long message where a character ends and leaves out details that are too long.
-pub(super) fn shorten(headers: &mut HeaderMap) {
+/// Cuts a long message at a character boundary and drops details that are too long.
+pub(super) fn truncate_status(headers: &mut HeaderMap) {
     if let Some(message) = headers.get_mut("grpc-message")
         && message.len() > MESSAGE
     {
@@ -30,7 +30,7 @@ pub(super) fn shorten(headers: &mut HeaderMap) {
     }
 }
 
-/// A character ends before this place: no escape is cut, and what follows does not continue one.
+/// Whether a character ends before this byte: no escape is cut, and the next byte does not continue a character.
 fn ends_at(bytes: &[u8], cut: usize) -> bool {
     let in_escape = (1..=2).any(|back| cut >= back && bytes[cut - back] == b'%');
     let continued = bytes[cut] == b'%' && matches!(bytes.get(cut + 1), Some(b'8' | b'9' | b'A' | b'B' | b'a' | b'b'));
@@ -45,7 +45,7 @@ mod tests {
 
     fn sent(status: Status) -> HeaderMap {
         let mut headers = status.into_http::<tonic::body::Body>().into_parts().0.headers;
-        shorten(&mut headers);
+        truncate_status(&mut headers);
         headers
     }
 
@@ -64,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn short_ones_stay_and_details_go_only_when_they_are_long() {
+    fn short_messages_are_unchanged_and_only_long_details_are_dropped() {
         let with = |field: &str| {
             let details = ErrorDetails::with_bad_request_violation(field, "no");
             sent(Status::with_error_details(Code::InvalidArgument, "short", details))

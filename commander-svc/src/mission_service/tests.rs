@@ -1,17 +1,18 @@
 use super::*;
-use crate::gauges::CommanderGauges;
-use crate::store::Store;
+use crate::metrics::CommanderMetrics;
+use crate::model_store::ModelStore;
 use magex_dispatch::disk::DiskError;
 use magex_dispatch::missions::Bounds;
 use magex_runtime::metrics::Metrics;
 use std::future::Future;
 use std::task::{Context, Waker};
+use std::time::Duration;
 use tonic::Code;
 
-fn keeper() -> Arc<Keeper> {
-    let gauges = Arc::new(CommanderGauges::new(&Metrics::new()));
-    let answering = Answering::new(Arc::new(Store::new()), gauges);
-    Keeper::new(Missions::open(None, Bounds::default()).unwrap(), answering)
+fn keeper() -> Arc<MissionService> {
+    let gauges = Arc::new(CommanderMetrics::new(&Metrics::new()));
+    let answering = AssignService::new(Arc::new(ModelStore::new()), gauges);
+    MissionService::new(Missions::open(None, Bounds::default()).unwrap(), answering)
 }
 
 fn client(name: &str) -> Caller {
@@ -29,41 +30,41 @@ fn request(id: &str, agents: usize, goals: usize) -> v1::CreateMissionRequest {
     v1::CreateMissionRequest { mission_id: id.into(), agents, goals, ..Default::default() }
 }
 
-fn clock() -> Clock {
-    Clock::start(None)
+fn budget() -> CallBudget {
+    CallBudget::start(None)
 }
 
-async fn all_processors(keeper: &Keeper) -> Vec<crate::answering::Places> {
+async fn all_processors(keeper: &MissionService) -> Vec<crate::assign_service::Places> {
     let mut taken = Vec::new();
     while keeper.answering.free_processors() > 0 {
-        taken.push(keeper.answering.places(1, clock().left()).await.unwrap());
+        taken.push(keeper.answering.places(1, budget().left()).await.unwrap());
     }
     taken
 }
 
 #[tokio::test]
-async fn the_smallest_mission_waits_for_a_processor_like_everybody() {
+async fn the_smallest_mission_waits_for_a_processor_too() {
     let keeper = keeper();
     let (me, tiny) = (client("me"), request("m", 1, 1));
-    keeper.create(me.clone(), tiny.clone(), clock()).await.unwrap();
+    keeper.create(me.clone(), tiny.clone(), budget()).await.unwrap();
     let taken = all_processors(&keeper).await;
     let update = v1::UpdateMissionRequest { mission_id: "m".into(), ..Default::default() };
     let (created, updated) = tokio::join!(
-        keeper.create(me.clone(), v1::CreateMissionRequest { mission_id: "n".into(), ..tiny }, clock()),
-        keeper.update(me.clone(), update.clone(), clock())
+        keeper.create(me.clone(), v1::CreateMissionRequest { mission_id: "n".into(), ..tiny }, budget()),
+        keeper.update(me.clone(), update.clone(), budget())
     );
     assert_eq!(
         (created.unwrap_err().code(), updated.unwrap_err().code()),
         (Code::ResourceExhausted, Code::ResourceExhausted)
     );
     drop(taken);
-    assert_eq!(keeper.update(me, update, clock()).await.unwrap().revision, 2);
+    assert_eq!(keeper.update(me, update, budget()).await.unwrap().revision, 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
+async fn nothing_is_planned_or_written_for_a_cancelled_call() {
     let keeper = keeper();
-    keeper.create(client("me"), request("old", 1, 1), clock()).await.unwrap();
+    keeper.create(client("me"), request("old", 1, 1), budget()).await.unwrap();
     let processors = keeper.answering.free_processors();
     let large = request("new", 1000, 1000);
     let update = v1::UpdateMissionRequest {
@@ -72,10 +73,12 @@ async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
         goals: large.goals.clone(),
         ..Default::default()
     };
-    let calls: [std::pin::Pin<Box<dyn Future<Output = _> + Send>>; 2] =
-        [Box::pin(keeper.create(client("me"), large, clock())), Box::pin(keeper.update(client("me"), update, clock()))];
+    let calls: [std::pin::Pin<Box<dyn Future<Output = _> + Send>>; 2] = [
+        Box::pin(keeper.create(client("me"), large, budget())),
+        Box::pin(keeper.update(client("me"), update, budget())),
+    ];
     for mut call in calls {
-        // The work is on its thread; then the caller hangs up, or its deadline is over.
+        // The work is on its thread; then the caller cancels, or its deadline passes.
         assert!(call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending());
         drop(call);
         while keeper.answering.free_processors() < processors {
@@ -87,9 +90,9 @@ async fn nothing_is_planned_or_written_for_a_caller_who_has_gone() {
 }
 
 #[tokio::test]
-async fn strangers_cannot_tell_a_mission_of_somebody_else_from_none() {
+async fn a_mission_of_another_client_looks_like_a_missing_one() {
     let keeper = keeper();
-    keeper.create(client("me"), request("mine", 1, 1), clock()).await.unwrap();
+    keeper.create(client("me"), request("mine", 1, 1), budget()).await.unwrap();
     let you = client("you");
     // Also while no processor is free.
     let _taken = all_processors(&keeper).await;
@@ -100,21 +103,21 @@ async fn strangers_cannot_tell_a_mission_of_somebody_else_from_none() {
     for id in ["mine", "none"] {
         assert_eq!(said(keeper.get(&you, id).unwrap_err(), id), none);
         assert_eq!(said(keeper.delete(you.clone(), id.into()).await.unwrap_err(), id), none);
-        assert_eq!(said(keeper.update(you.clone(), update(id), clock()).await.unwrap_err(), id), none);
+        assert_eq!(said(keeper.update(you.clone(), update(id), budget()).await.unwrap_err(), id), none);
     }
     keeper.delete(client("me"), "mine".into()).await.unwrap();
     assert_eq!(keeper.count(), 0);
 }
 
 #[test]
-fn a_disk_that_takes_nothing_is_a_reason_to_come_again() {
-    let status = kept(KeepError::Disk(DiskError::Resting));
+fn a_failed_write_is_unavailable_with_a_retry_delay() {
+    let status = to_status(KeepError::Disk(DiskError::Paused));
     assert_eq!(status.code(), Code::Unavailable);
-    assert!(status::retry_delay(&status).is_some() && status.message().contains("make room"), "{status}");
+    assert!(status::retry_delay(&status).is_some() && status.message().contains("free space"), "{status}");
 }
 
 #[test]
-fn the_learned_scheduler_takes_memory_for_the_larger_side_twice() {
+fn the_learned_scheduler_reserves_memory_for_the_square_of_the_larger_side() {
     let keeper = keeper();
     assert_eq!(keeper.cells((0, 0), (900, 1), false), 900);
     assert_eq!(keeper.cells((0, 0), (900, 1), true), 810_000);

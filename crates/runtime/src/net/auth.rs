@@ -1,10 +1,10 @@
-//! Who is calling, and what for: bearer tokens and client certificates with roles. The same for every service.
+//! Authentication by bearer token or client certificate, and authorisation by role. The same for every service.
 //!
-//! The file of identities holds no secrets, only SHA-256 of tokens and certificates:
+//! The file of identities holds no secrets, only the SHA-256 of tokens and certificates:
 //!
 //! ```toml
 //! [[identity]]
-//! name = "fleet-a"          # owner of its missions, and what limits count
+//! name = "fleet-a"          # owns missions; limits are counted per name
 //! role = "client"           # client, actor, commander or admin
 //! token_sha256 = "…"        # or certificate_sha256 = "…" (of the DER form)
 //! ```
@@ -12,34 +12,37 @@
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
+use tonic::codegen::http;
+use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo};
 use tonic::{Request, Status};
 
 /// What a caller may do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
-    /// Assignments and missions of its own; how a run stands.
+    /// Assignments, its own missions, and the status of a run.
     Client,
     /// Rollouts: leases, weights, the goals of training episodes.
     Actor,
     /// The weights of a run.
     Commander,
-    /// Everything, everybody's missions included.
+    /// Everything, including the missions of all clients.
     Admin,
 }
 
-/// Who calls.
+/// The authenticated origin of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {
-    /// Name of the identity: owner of its missions, and what limits count.
+    /// Name of the identity: owns missions, and limits are counted per name.
     pub name: Arc<str>,
-    /// What it may do.
+    /// Its permissions.
     pub role: Role,
 }
 
-/// A file of identities that cannot be used.
+/// A file of identities cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: {problem}")]
 pub struct AccessError {
@@ -47,12 +50,12 @@ pub struct AccessError {
     problem: String,
 }
 
-/// Who is let in.
+/// The identities that may call.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
-    /// By SHA-256, lower-case hex. `None`: everybody is let in, as far as TLS lets them.
+    /// By SHA-256, lower-case hex. `None`: every caller that passes TLS is an admin.
     known: Option<HashMap<String, Caller>>,
-    /// Somebody is known by a certificate.
+    /// At least one identity is known by its certificate.
     certificates: bool,
 }
 
@@ -76,7 +79,7 @@ impl Access {
     /// Reads a file of identities.
     ///
     /// # Errors
-    /// A file that cannot be read, or an identity that makes no sense.
+    /// The file cannot be read, or an identity is invalid.
     pub fn read(path: &Path) -> Result<Self, AccessError> {
         let wrong = |problem: String| AccessError { path: path.display().to_string(), problem };
         let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
@@ -86,13 +89,15 @@ impl Access {
     fn parse(text: &str) -> Result<Self, String> {
         let file: File = toml::from_str(text).map_err(|error| error.to_string())?;
         if file.identity.is_empty() {
-            return Err("no [[identity]]: nobody could call".to_owned());
+            return Err(
+                "identity: the file has no [[identity]] entry, so no caller could authenticate; add one".to_owned()
+            );
         }
         let (mut known, mut certificates) = (HashMap::new(), false);
         for (k, identity) in file.identity.into_iter().enumerate() {
             let place = format!("identity[{k}]");
             if identity.name.is_empty() {
-                return Err(format!("{place}.name: empty"));
+                return Err(format!("{place}.name: empty; give the identity a name"));
             }
             certificates |= identity.certificate_sha256.is_some();
             let hash = match (identity.token_sha256, identity.certificate_sha256) {
@@ -110,58 +115,72 @@ impl Access {
         Ok(Self { known: Some(known), certificates })
     }
 
-    /// Callers must show who they are.
+    /// Callers must authenticate.
     pub fn restricted(&self) -> bool {
         self.known.is_some()
     }
 
-    /// Somebody is known by a certificate: callers have to be asked for theirs.
+    /// At least one identity is known by its certificate, so the server must request client certificates.
     pub fn needs_certificates(&self) -> bool {
         self.certificates
     }
 
-    /// Who makes this call.
+    /// Authenticates a call by its `authorization` header, or else by its client certificate.
     ///
     /// # Errors
-    /// UNAUTHENTICATED: nobody who is known here.
-    pub fn identify<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
-        let certificate = request.peer_certs().and_then(|chain| chain.first().map(|leaf| sha256_hex(leaf.as_ref())));
+    /// UNAUTHENTICATED: the credentials are missing or unknown.
+    pub fn authenticate<T>(&self, request: &http::Request<T>) -> Result<Caller, Status> {
+        let tls = request.extensions().get::<TlsConnectInfo<TcpConnectInfo>>();
+        let certificate = tls
+            .and_then(TlsConnectInfo::peer_certs)
+            .and_then(|chain| chain.first().map(|leaf| sha256_hex(leaf.as_ref())));
         let Some(known) = &self.known else {
-            let name = match (&certificate, request.remote_addr()) {
+            let name = match (&certificate, peer_address(request.extensions())) {
                 (Some(hash), _) => format!("certificate-{}", &hash[..16]),
                 (None, Some(address)) => address.ip().to_string(),
                 (None, None) => "local".to_owned(),
             };
             return Ok(Caller { name: name.into(), role: Role::Admin });
         };
-        if let Some(value) = request.metadata().get("authorization") {
-            // Only digests are compared, so the time it takes says nothing about a token.
+        if let Some(value) = request.headers().get("authorization") {
+            // Only digests are compared, so the duration reveals nothing about a token.
             let token = value.to_str().ok().and_then(|text| text.strip_prefix("Bearer "));
             let caller = token.and_then(|token| known.get(&sha256_hex(token.trim().as_bytes())));
-            return caller.cloned().ok_or_else(|| Status::unauthenticated("this bearer token is not known here"));
+            return caller.cloned().ok_or_else(|| {
+                Status::unauthenticated(
+                    "authorization: unknown bearer token; check the token, or add its SHA-256 to --identities",
+                )
+            });
         }
         let caller = certificate.and_then(|hash| known.get(&hash));
         caller.cloned().ok_or_else(|| {
             Status::unauthenticated(
-                "send 'authorization: Bearer TOKEN', or use a client certificate that is known here",
+                "authorization: missing; send 'authorization: Bearer TOKEN', or connect with a client certificate listed in --identities",
             )
         })
     }
 }
 
-/// The caller of a request that came through the door, if it may do this. Admins may do everything.
+/// The authenticated caller of a request, if its role is among `allowed`. Admins are always allowed.
 ///
 /// # Errors
-/// PERMISSION_DENIED: it has another role.
+/// PERMISSION_DENIED: the caller has another role.
 pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
     let Some(caller) = request.extensions().get::<Caller>() else {
-        return Err(Status::internal("a call came in without its caller"));
+        return Err(Status::internal("the call was not authenticated"));
     };
     if caller.role == Role::Admin || allowed.contains(&caller.role) {
         return Ok(caller.clone());
     }
     let role = format!("{:?}", caller.role).to_lowercase();
-    Err(Status::permission_denied(format!("'{}' has the role {role}, which may not do this", caller.name)))
+    Err(Status::permission_denied(format!("'{}' has the role {role}, which may not call this method", caller.name)))
+}
+
+/// The address that a call comes from; `None` in process.
+pub(super) fn peer_address(extensions: &http::Extensions) -> Option<SocketAddr> {
+    let plain = extensions.get::<TcpConnectInfo>();
+    let info = plain.or_else(|| extensions.get::<TlsConnectInfo<TcpConnectInfo>>().map(TlsConnectInfo::get_ref));
+    info.and_then(TcpConnectInfo::remote_addr)
 }
 
 /// SHA-256 as lower-case hex.
@@ -174,27 +193,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tokens_are_known_by_their_hash() {
+    fn tokens_authenticate_by_their_hash() {
         let hash = sha256_hex(b"secret");
         let text = format!("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = '{}'", hash.to_uppercase());
         let access = Access::parse(&text).unwrap();
         let ask = |value: Option<&str>| {
-            let mut request = Request::new(());
+            let mut request = http::Request::new(());
             if let Some(value) = value {
-                request.metadata_mut().insert("authorization", value.parse().unwrap());
+                request.headers_mut().insert("authorization", value.parse().unwrap());
             }
-            access.identify(&request)
+            access.authenticate(&request)
         };
         let caller = ask(Some("Bearer secret")).unwrap();
         assert_eq!((&*caller.name, caller.role), ("a", Role::Client));
         for wrong in [None, Some("Bearer Secret"), Some("secret"), Some("Bearer "), Some("Basic secret")] {
             assert_eq!(ask(wrong).unwrap_err().code(), tonic::Code::Unauthenticated, "{wrong:?}");
         }
-        assert_eq!(Access::default().identify(&Request::new(())).unwrap().role, Role::Admin);
+        assert_eq!(Access::default().authenticate(&http::Request::new(())).unwrap().role, Role::Admin);
     }
 
     #[test]
-    fn roles_open_only_their_doors() {
+    fn a_role_may_call_only_its_own_methods() {
         let mut request = Request::new(());
         request.extensions_mut().insert(Caller { name: "a".into(), role: Role::Actor });
         assert!(caller(&request, &[Role::Actor]).is_ok());
@@ -207,9 +226,9 @@ mod tests {
     }
 
     #[test]
-    fn files_that_make_no_sense_are_refused() {
+    fn invalid_files_are_rejected() {
         for (text, words) in [
-            ("", "nobody could call"),
+            ("", "no [[identity]]"),
             ("[[identity]]\nname = 'a'\nrole = 'king'", "unknown variant"),
             ("[[identity]]\nname = 'a'\nrole = 'client'", "identity[0]: give either"),
             ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = 'abc'", "64 hexadecimal"),

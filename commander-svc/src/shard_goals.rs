@@ -1,19 +1,21 @@
-//! Answers for the teams of one shard: a pure function of the request and the weights.
+//! The goals of one shard: a pure function of the request and the weights.
 
-use magex_assign::exact_points;
 use magex_assign::random::random;
+use magex_assign::{cost_of_points, exact_points};
 use magex_core::keys::{episode_keys, random_goals};
 use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::goals::{GoalReply, GoalRequest};
 
-/// Assigns the goals of every stage of every episode of a shard. What is random is keyed by (seed, shard, episode).
+/// Assigns the goals of every stage of every episode of a shard. Random choices are keyed by (seed, shard, episode).
 /// `random_assignment_fraction` of the training episodes get a random matching, whatever the scheduler.
-/// Interrupted once `go_on` says that nobody waits for it any more; it is asked before every team.
+///
+/// # Errors
+/// Arrays that do not match the sizes; `Interrupted` if `should_continue`, which is called before every team, returns false.
 pub fn answer(
     commander: &Commander,
     random_assignment_fraction: f32,
     request: &GoalRequest,
-    go_on: &dyn Fn() -> bool,
+    should_continue: &dyn Fn() -> bool,
 ) -> Result<GoalReply, CommanderError> {
     let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     let b = request.shard.episodes as usize;
@@ -34,7 +36,7 @@ pub fn answer(
         let mut stream = episode_keys(request.seed, &request.shard, e as u32).commander.stream();
         let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_assignment_fraction);
         for stage in e * k..(e + 1) * k {
-            if !go_on() {
+            if !should_continue() {
                 return Err(CommanderError::Interrupted);
             }
             let team = Team {
@@ -49,25 +51,13 @@ pub fn answer(
                     (decision.goals, decision.log_prob)
                 }
             };
-            reply.costs.push(cost(&team, &goals) as f32);
+            reply.costs.push(cost_of_points(team.agents, team.goals, d, &goals) as f32);
             reply.exact_costs.push(exact_points(team.agents, team.goals, d)?.1 as f32);
             reply.log_probs.push(log_prob);
             reply.goals.extend(goals);
         }
     }
     Ok(reply)
-}
-
-/// Summed distance of an assignment in double precision; agents without a goal cost nothing.
-pub fn cost(team: &Team<'_>, goals: &[u32]) -> f64 {
-    let d = team.dims;
-    let mut total = 0.0;
-    for (agent, goal) in team.agents.chunks_exact(d).zip(goals) {
-        if let Some(goal) = team.goals.chunks_exact(d).nth(*goal as usize) {
-            total += agent.iter().zip(goal).map(|(a, g)| (f64::from(*a) - f64::from(*g)).powi(2)).sum::<f64>().sqrt();
-        }
-    }
-    total
 }
 
 #[cfg(test)]
@@ -77,10 +67,9 @@ mod tests {
     use super::*;
     use magex_core::config::CommanderPolicy;
     use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
-    use magex_proto::goals::SchedulerKind;
 
     #[test]
-    fn a_shard_without_agents_dimensions_or_stages_is_refused() {
+    fn a_shard_without_agents_dimensions_or_stages_is_rejected() {
         let shard = Shard {
             kind: ShardKind::Train,
             iteration: Iteration(0),
@@ -92,10 +81,9 @@ mod tests {
             eval_set: 0,
             record: false,
         };
-        let scheduler = SchedulerKind::Exact;
         let (agents, goals) = (vec![0.0, 0.0], vec![1.0, 0.0]);
         let (stages, agent_count, goal_count, dims) = (1, 1, 1, 2);
-        let good = GoalRequest { shard, seed: 1, scheduler, stages, agent_count, goal_count, dims, agents, goals };
+        let good = GoalRequest { shard, seed: 1, stages, agent_count, goal_count, dims, agents, goals };
         let commander = Commander::classical(CommanderPolicy::Exact).unwrap();
         assert_eq!(answer(&commander, 0.0, &good, &|| true).unwrap().goals, [0]);
         assert!(matches!(answer(&commander, 0.0, &good, &|| false), Err(CommanderError::Interrupted)));

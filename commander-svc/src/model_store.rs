@@ -1,4 +1,4 @@
-//! The models that can answer, newest last.
+//! The models in memory, newest last.
 
 use crate::scheduler::{Scheduler, WeightsKey};
 use std::fmt;
@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// Models that are kept: actors may ask for one that is no longer the latest.
+/// Models in memory: actors may request one that is no longer the latest.
 const KEPT: usize = 4;
 
-/// One version of the weights, made into a scheduler; or why that was not possible.
+/// The scheduler of one version of the weights, or why the weights are unusable.
 #[derive(Clone)]
 pub(crate) struct Model {
     pub(crate) key: Arc<WeightsKey>,
@@ -22,13 +22,13 @@ impl fmt::Debug for Model {
     }
 }
 
-/// Filled by the subscription, read by requests, which may wait for a version.
+/// Filled by the subscription or the weights file; requests read it and may wait for a version.
 #[derive(Debug)]
-pub(crate) struct Store {
+pub(crate) struct ModelStore {
     models: watch::Sender<Arc<Vec<Model>>>,
 }
 
-impl Store {
+impl ModelStore {
     pub(crate) fn new() -> Self {
         Self { models: watch::Sender::new(Arc::default()) }
     }
@@ -42,25 +42,25 @@ impl Store {
         });
     }
 
-    /// The newest model that can answer. Whoever holds it answers from this version alone, whatever comes in meanwhile.
+    /// The newest usable model. A request that holds it answers from this version only.
     pub(crate) fn latest(&self) -> Option<(Arc<WeightsKey>, Arc<dyn Scheduler>)> {
         let models = self.models.borrow();
         models.iter().rev().find_map(|model| Some((model.key.clone(), model.scheduler.as_ref().ok()?.clone())))
     }
 
-    /// The model of this name, as soon as it is here, for at most `patience`.
-    pub(crate) async fn wait(&self, key: &WeightsKey, patience: Duration) -> Option<Model> {
+    /// Waits at most `timeout` for the model of this key.
+    pub(crate) async fn wait(&self, key: &WeightsKey, timeout: Duration) -> Option<Model> {
         let mut models = self.models.subscribe();
         let find = |models: &Vec<Model>| models.iter().find(|model| *model.key == *key).cloned();
         let arrived = models.wait_for(|models| find(models).is_some());
-        let models = tokio::time::timeout(patience, arrived).await.ok()?.ok()?;
+        let models = tokio::time::timeout(timeout, arrived).await.ok()?.ok()?;
         find(&models)
     }
 
-    /// Returns once there is a model that can answer.
+    /// Waits for a usable model.
     pub(crate) async fn ready(&self) {
         let usable = |models: &Arc<Vec<Model>>| models.iter().any(|model| model.scheduler.is_ok());
-        // The sender is ours: waiting cannot fail.
+        // Cannot fail: `self` owns the sender.
         let _ = self.models.subscribe().wait_for(usable).await.map(drop);
     }
 }

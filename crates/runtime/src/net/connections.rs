@@ -1,12 +1,12 @@
-//! Who is connected: as many as there is room for, and nobody for long who asks nothing.
+//! Connection table: enforces total and per-peer limits and closes connections that send no call within
+//! [`ConnectionLimits::first_call`].
 //!
-//! A connection counts as *waiting* until the first call of somebody who is known has come in. It has to come within
-//! [`ConnectionLimits::first_call`], handshakes included, so sockets that say nothing, or say it slowly, are closed. One that
-//! only asks what anybody may ask (health, reflection, a page for operators) may stay, but goes on waiting. When there is no
-//! room the one that has waited longest makes way: a flood of idle sockets pushes itself out, and who has something to ask
-//! still gets in.
+//! A connection is `Silent` until its first call, `Probed` after a call to a public service (health, reflection, the HTTP
+//! page), and `Called` after an authenticated call. A `Silent` connection is closed after `first_call`, handshakes included.
+//! At a limit, the oldest connection that is not yet `Called` is evicted for the new one, so that a flood of idle sockets
+//! evicts itself and callers with credentials still get in. A `Called` connection is never evicted.
 
-use crate::admission::{Admission, FlightLimits};
+use crate::net::in_flight::{InFlight, InFlightLimits};
 use std::collections::{BTreeMap, HashMap};
 use std::future::Future as _;
 use std::io::{Error, ErrorKind, IoSlice};
@@ -25,24 +25,46 @@ use tonic::transport::server::{Connected, TcpConnectInfo};
 
 /// Files that a process needs besides its connections.
 const OTHER_FILES: usize = 128;
-/// What anybody may have in flight without saying who it is, by address: for probes and tools.
-const GUESTS: FlightLimits = FlightLimits { calls: 256, streams: 64, caller_bytes: 1 << 20, bytes: 16 << 20 };
-/// How long nobody is accepted after the system refused to (no files are left).
+/// What one address may have in flight without credentials: for probes and tools.
+const ANONYMOUS: InFlightLimits = InFlightLimits { calls: 256, streams: 64, caller_bytes: 1 << 20, bytes: 16 << 20 };
+/// Pause after a failed accept (no file descriptors are left).
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// What a connection has asked for so far: nothing; what anybody may ask; what callers who are known ask.
-const SILENT: u8 = 0;
-const PROBED: u8 = 1;
-const CALLED: u8 = 2;
+/// What a connection has sent so far. A state is only ever raised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+enum State {
+    /// No call.
+    Silent,
+    /// A call to a public service.
+    Probed,
+    /// An authenticated call.
+    Called,
+}
 
-/// How many connections a server has, and how patient it is with new ones.
+/// The state of a connection, read by its socket with every read and write without the lock of the table.
+#[derive(Debug, Default)]
+struct SharedState(AtomicU8);
+
+impl SharedState {
+    fn is(&self, state: State) -> bool {
+        self.0.load(Ordering::Relaxed) == state as u8
+    }
+
+    /// Raises the state; whether that changed it.
+    fn raise(&self, state: State) -> bool {
+        self.0.fetch_max(state as u8, Ordering::Relaxed) < state as u8
+    }
+}
+
+/// Limits of the connections of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ConnectionLimits {
-    /// Of everybody.
+    /// Connections of all peers.
     pub total: usize,
-    /// From one address.
+    /// Connections from one IP address.
     pub per_peer: usize,
-    /// A connection whose first call has not come after this time is closed.
+    /// A connection without a call after this time is closed.
     pub first_call: Duration,
 }
 
@@ -57,13 +79,13 @@ impl Default for ConnectionLimits {
 pub struct Connections {
     limits: ConnectionLimits,
     table: Arc<Mutex<Table>>,
-    guests: Arc<Admission>,
+    anonymous: Arc<InFlight>,
 }
 
 #[derive(Debug, Default)]
 struct Table {
     open: HashMap<SocketAddr, Entry>,
-    /// Those without a call, by age.
+    /// Connections that may be evicted (not `Called`), oldest first.
     waiting: BTreeMap<u64, SocketAddr>,
     peers: HashMap<IpAddr, usize>,
     next: u64,
@@ -72,7 +94,7 @@ struct Table {
 #[derive(Debug)]
 struct Entry {
     number: u64,
-    state: Arc<AtomicU8>,
+    state: Arc<SharedState>,
     close: CancellationToken,
 }
 
@@ -80,34 +102,34 @@ impl Connections {
     fn new(limits: ConnectionLimits) -> Self {
         let files = crate::process::open_files().saturating_sub(OTHER_FILES).max(1);
         if files < limits.total {
-            tracing::debug!(files, "fewer connections than configured: the system allows no more open files");
+            tracing::debug!(files, "connection limit lowered to the limit of open files");
         }
         let total = limits.total.min(files);
         let limits = ConnectionLimits { total, per_peer: limits.per_peer.min(total), ..limits };
-        // They are answered while the service drains: that is what they ask about.
-        Self { limits, table: Arc::default(), guests: Admission::new(GUESTS, CancellationToken::new()) }
+        // Never drains: probes must get an answer while the service drains.
+        Self { limits, table: Arc::default(), anonymous: InFlight::new(ANONYMOUS, CancellationToken::new()) }
     }
 
-    /// Somebody who is known called on the connection from this address: it makes way for nobody.
+    /// An authenticated call arrived on the connection from this address: it is no longer evicted.
     pub fn called(&self, address: SocketAddr) {
         let mut table = self.lock();
         let Some(entry) = table.open.get(&address) else { return };
-        if entry.state.swap(CALLED, Ordering::Relaxed) != CALLED {
+        if entry.state.raise(State::Called) {
             let number = entry.number;
             table.waiting.remove(&number);
         }
     }
 
-    /// Somebody asked what anybody may ask: the connection stays until there is no room.
+    /// A call to a public service arrived: the connection stays until it is evicted.
     pub fn probed(&self, address: SocketAddr) {
         if let Some(entry) = self.lock().open.get(&address) {
-            entry.state.fetch_max(PROBED, Ordering::Relaxed);
+            entry.state.raise(State::Probed);
         }
     }
 
-    /// What those have in flight who need not say who they are.
-    pub fn guests(&self) -> &Arc<Admission> {
-        &self.guests
+    /// What callers of public services have in flight, by address.
+    pub fn anonymous(&self) -> &Arc<InFlight> {
+        &self.anonymous
     }
 
     /// Connections that are open.
@@ -115,8 +137,8 @@ impl Connections {
         self.lock().open.len()
     }
 
-    /// A place for one more, or `None` when every place is taken by somebody who has asked for something.
-    fn admit(&self, address: SocketAddr) -> Option<Place> {
+    /// Adds a connection; `None` at a limit when no connection can be evicted.
+    fn admit(&self, address: SocketAddr) -> Option<Slot> {
         let mut table = self.lock();
         let of_peer = |table: &Table| table.peers.get(&address.ip()).copied().unwrap_or(0);
         if of_peer(&table) >= self.limits.per_peer {
@@ -126,17 +148,17 @@ impl Connections {
             let oldest = table.waiting.values().copied().next()?;
             table.close(oldest);
         }
-        let (number, state, close) = (table.next, Arc::new(AtomicU8::new(SILENT)), CancellationToken::new());
+        let (number, state, close) = (table.next, Arc::<SharedState>::default(), CancellationToken::new());
         table.next += 1;
-        // The system gives the same address again only after the old connection is gone; its place may still be there.
+        // The system reuses an address only after the old connection has ended; its entry may still be there.
         table.close(address);
         table.open.insert(address, Entry { number, state: state.clone(), close: close.clone() });
         table.waiting.insert(number, address);
         *table.peers.entry(address.ip()).or_default() += 1;
         drop(table);
-        let patience = Box::pin(tokio::time::sleep(self.limits.first_call));
-        let closed = Box::pin(close.cancelled_owned());
-        Some(Place { connections: self.clone(), address, number, state, patience, closed })
+        let first_call = Box::pin(tokio::time::sleep(self.limits.first_call));
+        let evicted = Box::pin(close.cancelled_owned());
+        Some(Slot { connections: self.clone(), address, number, state, first_call, evicted })
     }
 
     fn lock(&self) -> MutexGuard<'_, Table> {
@@ -146,7 +168,7 @@ impl Connections {
 }
 
 impl Table {
-    /// Takes a connection off the list and tells it to end.
+    /// Removes a connection and closes it.
     fn close(&mut self, address: SocketAddr) {
         let Some(entry) = self.open.remove(&address) else { return };
         self.waiting.remove(&entry.number);
@@ -160,35 +182,34 @@ impl Table {
     }
 }
 
-/// A connection's place on the list; free again when dropped.
+/// A connection's entry in the table; removed when dropped.
 #[derive(Debug)]
-struct Place {
+struct Slot {
     connections: Connections,
     address: SocketAddr,
     number: u64,
-    state: Arc<AtomicU8>,
-    patience: Pin<Box<Sleep>>,
-    closed: Pin<Box<WaitForCancellationFutureOwned>>,
+    state: Arc<SharedState>,
+    first_call: Pin<Box<Sleep>>,
+    evicted: Pin<Box<WaitForCancellationFutureOwned>>,
 }
 
-impl Place {
-    /// Fails once a connection that has asked for nothing has to go.
+impl Slot {
+    /// Fails once the connection was evicted or has sent no call in time.
     fn check(&mut self, cx: &mut Context<'_>) -> Result<(), Error> {
-        let state = self.state.load(Ordering::Relaxed);
-        if state == CALLED {
+        if self.state.is(State::Called) {
             return Ok(());
         }
-        if self.closed.as_mut().poll(cx).is_ready() {
-            return Err(Error::new(ErrorKind::ConnectionAborted, "made way for another connection"));
+        if self.evicted.as_mut().poll(cx).is_ready() {
+            return Err(Error::new(ErrorKind::ConnectionAborted, "evicted at the connection limit"));
         }
-        if state == SILENT && self.patience.as_mut().poll(cx).is_ready() {
-            return Err(Error::new(ErrorKind::TimedOut, "no call came"));
+        if self.state.is(State::Silent) && self.first_call.as_mut().poll(cx).is_ready() {
+            return Err(Error::new(ErrorKind::TimedOut, "no call arrived in time"));
         }
         Ok(())
     }
 }
 
-impl Drop for Place {
+impl Drop for Slot {
     fn drop(&mut self) {
         let mut table = self.connections.lock();
         if table.open.get(&self.address).is_some_and(|entry| entry.number == self.number) {
@@ -197,11 +218,11 @@ impl Drop for Place {
     }
 }
 
-/// A connection that has a place.
+/// A connection with an entry in the table.
 #[derive(Debug)]
 pub struct Connection {
     stream: TcpStream,
-    place: Place,
+    slot: Slot,
 }
 
 impl Connected for Connection {
@@ -214,14 +235,14 @@ impl Connected for Connection {
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<Result<(), Error>> {
-        self.place.check(cx)?;
+        self.slot.check(cx)?;
         Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<Result<usize, Error>> {
-        self.place.check(cx)?;
+        self.slot.check(cx)?;
         Pin::new(&mut self.stream).poll_write(cx, bytes)
     }
 
@@ -230,7 +251,7 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         slices: &[IoSlice<'_>],
     ) -> Poll<Result<usize, Error>> {
-        self.place.check(cx)?;
+        self.slot.check(cx)?;
         Pin::new(&mut self.stream).poll_write_vectored(cx, slices)
     }
 
@@ -247,7 +268,7 @@ impl AsyncWrite for Connection {
     }
 }
 
-/// What a listener accepts, as far as there is room. Never ends by itself: a system that refuses is asked again.
+/// The connections of a listener, within limits. Never ends by itself: a failed accept is retried.
 #[derive(Debug)]
 pub struct Incoming {
     listener: TcpListener,
@@ -261,25 +282,25 @@ impl Incoming {
         Self { listener, connections: Connections::new(limits), pause: None }
     }
 
-    /// The same listener within other limits; before the first connection.
+    /// The same listener with other limits; before the first connection.
     #[must_use]
     pub fn within(self, limits: ConnectionLimits) -> Self {
         Self::new(self.listener, limits)
     }
 
-    /// The list that these connections are on.
+    /// The table of these connections.
     pub fn connections(&self) -> Connections {
         self.connections.clone()
     }
 
     fn take(&self, stream: TcpStream, address: SocketAddr) -> Option<Connection> {
-        let Some(place) = self.connections.admit(address) else {
-            tracing::debug!(peer = %address, "no room for another connection");
+        let Some(slot) = self.connections.admit(address) else {
+            tracing::debug!(peer = %address, "connection limit reached; connection rejected");
             return None;
         };
-        // Without Nagle's delay. One that is gone already is noticed with its first read.
+        // Without Nagle's delay. A connection that is already closed fails with its first read.
         let _ = stream.set_nodelay(true);
-        Some(Connection { stream, place })
+        Some(Connection { stream, slot })
     }
 }
 
@@ -289,9 +310,9 @@ impl axum::serve::Listener for Incoming {
 
     async fn accept(&mut self) -> (Connection, SocketAddr) {
         loop {
-            // Never ends, and never fails: see the stream.
+            // The stream below never ends and never fails.
             if let Some(Ok(connection)) = std::future::poll_fn(|cx| Pin::new(&mut *self).poll_next(cx)).await {
-                let address = connection.place.address;
+                let address = connection.slot.address;
                 return (connection, address);
             }
         }
@@ -318,7 +339,7 @@ impl Stream for Incoming {
                     }
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "a connection could not be accepted");
+                    tracing::warn!(%error, "accept failed");
                     self.pause = Some(Box::pin(tokio::time::sleep(PAUSE)));
                 }
             }
@@ -334,57 +355,57 @@ mod tests {
         ([127, 0, 0, host], port).into()
     }
 
-    fn gone(place: &mut Place) -> bool {
-        place.check(&mut Context::from_waker(std::task::Waker::noop())).is_err()
+    fn closed(slot: &mut Slot) -> bool {
+        slot.check(&mut Context::from_waker(std::task::Waker::noop())).is_err()
     }
 
     #[tokio::test]
-    async fn who_waits_longest_makes_way_and_who_has_called_stays() {
+    async fn at_a_limit_the_oldest_silent_connection_is_evicted_and_a_called_one_stays() {
         let limits = ConnectionLimits { total: 3, per_peer: 2, first_call: Duration::from_secs(60) };
         let connections = Connections::new(limits);
         let mut first = connections.admit(address(1, 1)).unwrap();
         let mut second = connections.admit(address(1, 2)).unwrap();
-        // The peer's own oldest goes.
+        // The peer's own oldest is evicted.
         let mut third = connections.admit(address(1, 3)).unwrap();
-        assert_eq!([gone(&mut first), gone(&mut second), gone(&mut third)], [true, false, false]);
+        assert_eq!([closed(&mut first), closed(&mut second), closed(&mut third)], [true, false, false]);
         drop(first);
         assert_eq!(connections.open(), 2);
         connections.called(address(1, 2));
         connections.called(address(1, 3));
-        assert!(connections.admit(address(1, 4)).is_none(), "both places of this peer are at work");
-        // Somebody else still gets in, and the total counts for all.
+        assert!(connections.admit(address(1, 4)).is_none(), "both connections of this peer have called");
+        // Another peer still gets in, and the total counts for all.
         let mut other = connections.admit(address(2, 1)).unwrap();
         let another = connections.admit(address(3, 1)).unwrap();
-        assert!(gone(&mut other) && !gone(&mut second) && !gone(&mut third));
+        assert!(closed(&mut other) && !closed(&mut second) && !closed(&mut third));
         drop((second, third, other, another));
         assert_eq!(connections.open(), 0);
         assert!(connections.lock().peers.is_empty() && connections.lock().waiting.is_empty());
     }
 
     #[tokio::test]
-    async fn a_first_call_has_to_come_in_time() {
+    async fn a_connection_without_a_call_is_closed_in_time() {
         let first_call = Duration::from_millis(50);
         let connections = Connections::new(ConnectionLimits { first_call, ..ConnectionLimits::default() });
         let (mut mute, mut busy) =
             (connections.admit(address(1, 1)).unwrap(), connections.admit(address(1, 2)).unwrap());
         connections.called(address(1, 2));
         tokio::time::sleep(2 * first_call).await;
-        assert!(gone(&mut mute) && !gone(&mut busy));
+        assert!(closed(&mut mute) && !closed(&mut busy));
     }
 
     #[tokio::test]
-    async fn who_only_probes_stays_until_there_is_no_room() {
+    async fn a_probed_connection_stays_until_it_is_evicted() {
         let limits = ConnectionLimits { total: 2, per_peer: 2, first_call: Duration::from_millis(50) };
         let connections = Connections::new(limits);
         let (mut probe, mut known) =
             (connections.admit(address(1, 1)).unwrap(), connections.admit(address(1, 2)).unwrap());
         connections.probed(address(1, 1));
         connections.called(address(1, 2));
-        // A probe of somebody who is known takes nothing away.
+        // A probe does not lower the state.
         connections.probed(address(1, 2));
         tokio::time::sleep(2 * limits.first_call).await;
-        assert!(!gone(&mut probe) && !gone(&mut known));
+        assert!(!closed(&mut probe) && !closed(&mut known));
         let _another = connections.admit(address(1, 3)).unwrap();
-        assert!(gone(&mut probe) && !gone(&mut known));
+        assert!(closed(&mut probe) && !closed(&mut known));
     }
 }

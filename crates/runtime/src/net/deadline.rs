@@ -1,15 +1,26 @@
-//! A caller's own deadline, kept by the server with the code that the protocol has for it.
+//! A caller's deadline (`grpc-timeout`), parsed once per call and enforced with DEADLINE_EXCEEDED.
+//!
+//! tonic parses the header too, but its parser is private and its timer answers CANCELLED (hyperium/tonic#606).
 
 use std::convert::Infallible;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::{BoxFuture, Service, http};
 use tonic::server::NamedService;
 
-/// What a `grpc-timeout` header says: up to eight digits and a unit.
-pub fn requested(text: &str) -> Option<Duration> {
+/// The deadline of a call, in the request's extensions. Absent when the caller sent none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Deadline {
+    /// Arrival of the call.
+    pub start: Instant,
+    /// Time from arrival to the deadline.
+    pub timeout: Duration,
+}
+
+/// Parses a `grpc-timeout` header: up to eight digits and a unit.
+fn parse(text: &str) -> Option<Duration> {
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.len() > 8 {
         return None;
@@ -26,24 +37,24 @@ pub fn requested(text: &str) -> Option<Duration> {
     }
 }
 
-/// A service whose calls end with DEADLINE_EXCEEDED when the caller's time is over; the server's own timer would say CANCELLED.
+/// A service whose calls end with DEADLINE_EXCEEDED at the caller's deadline, and whose handlers find it as [`Deadline`].
 #[derive(Debug, Clone)]
-pub struct Deadline<S> {
+pub struct WithDeadline<S> {
     inner: S,
 }
 
-impl<S> Deadline<S> {
-    /// Around a generated service.
+impl<S> WithDeadline<S> {
+    /// Wraps a generated service.
     pub fn new(inner: S) -> Self {
         Self { inner }
     }
 }
 
-impl<S: NamedService> NamedService for Deadline<S> {
+impl<S: NamedService> NamedService for WithDeadline<S> {
     const NAME: &'static str = S::NAME;
 }
 
-impl<S, B> Service<http::Request<B>> for Deadline<S>
+impl<S, B> Service<http::Request<B>> for WithDeadline<S>
 where
     S: Service<http::Request<B>, Response = http::Response<Body>, Error = Infallible>,
     S::Future: Send + 'static,
@@ -56,17 +67,21 @@ where
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, request: http::Request<B>) -> Self::Future {
+    fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
         let header = request.headers().get("grpc-timeout").and_then(|value| value.to_str().ok());
-        let Some(time) = header.and_then(requested) else { return Box::pin(self.inner.call(request)) };
-        // Begins no later than the server's own timer and is asked first, so that it has the last word.
-        let sleep = tokio::time::sleep(time);
+        let Some(timeout) = header.and_then(parse) else { return Box::pin(self.inner.call(request)) };
+        request.extensions_mut().insert(Deadline { start: Instant::now(), timeout });
+        // Starts no later than tonic's own timer and is polled first, so that this answer wins.
+        let sleep = tokio::time::sleep(timeout);
         let answer = self.inner.call(request);
         Box::pin(async move {
             tokio::select! {
                 biased;
                 answer = answer => answer,
-                () = sleep => Ok(Status::deadline_exceeded(format!("not done within the caller's {time:?}")).into_http()),
+                () = sleep => {
+                    let problem = format!("grpc-timeout: not done within {timeout:?}");
+                    Ok(Status::deadline_exceeded(problem).into_http())
+                }
             }
         })
     }
@@ -78,11 +93,11 @@ mod tests {
     use tonic::Code;
 
     #[test]
-    fn timeouts_are_read_and_nonsense_is_not() {
-        assert_eq!(requested("250m"), Some(Duration::from_millis(250)));
-        assert_eq!(requested("1S"), Some(Duration::from_secs(1)));
+    fn valid_timeouts_are_parsed_and_invalid_ones_ignored() {
+        assert_eq!(parse("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(parse("1S"), Some(Duration::from_secs(1)));
         for text in ["", "S", "1", "x1S", "123456789n", "1s", "-1S"] {
-            assert_eq!(requested(text), None, "{text}");
+            assert_eq!(parse(text), None, "{text}");
         }
     }
 
@@ -108,14 +123,14 @@ mod tests {
     async fn a_deadline_that_passes_has_its_own_code() {
         let mut request = http::Request::new(Body::empty());
         request.headers_mut().insert("grpc-timeout", http::HeaderValue::from_static("20m"));
-        let answer = Deadline::new(Mute).call(request).await.unwrap_or_else(|never| match never {});
+        let answer = WithDeadline::new(Mute).call(request).await.unwrap_or_else(|never| match never {});
         let status = Status::from_header_map(answer.headers()).unwrap();
         assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
     }
 
     #[tokio::test]
-    async fn without_one_the_service_takes_its_time() {
-        let waiting = Deadline::new(Mute).call(http::Request::new(Body::empty()));
+    async fn without_a_deadline_the_service_is_not_cut_off() {
+        let waiting = WithDeadline::new(Mute).call(http::Request::new(Body::empty()));
         assert!(tokio::time::timeout(Duration::from_millis(50), waiting).await.is_err());
     }
 }

@@ -1,25 +1,26 @@
-//! The teams of a shard, for actors: what may be asked, and on which threads it is answered.
+//! Answers the teams of a shard for an actor, with the scheduler of its run.
 
-use crate::answering::{Answering, Clock};
-use crate::classical;
-use crate::scheduler::{AssignError, GoalReply, GoalRequest, SchedulerKind, WeightsKey};
-use crate::store::Store;
+use crate::assign_service::AssignService;
+use crate::call_budget::CallBudget;
+use crate::cancel::CancelOnDrop;
+use crate::error::to_status;
+use crate::model_store::ModelStore;
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, WeightsKey};
 use magex_dispatch::Limits;
 use magex_runtime::status;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 /// How long an actor's request waits for the weights that it names, and for a thread.
-const PATIENCE: Duration = Duration::from_secs(5);
+const QUEUE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Pairs of all teams of a shard: seconds of work.
+/// Maximum number of pairs of all teams of a shard: seconds of work.
 const PAIRS: usize = 64_000_000;
 
-/// Teams of a shard.
+/// Maximum number of teams of a shard.
 const TEAMS: usize = 65_536;
 
 /// Longest name of a run, and of weights, bytes.
@@ -28,83 +29,68 @@ const SHA256: usize = 64;
 
 /// Answers shards.
 #[derive(Debug)]
-pub(crate) struct Batches {
-    store: Arc<Store>,
-    answering: Arc<Answering>,
+pub(crate) struct ShardAssign {
+    store: Arc<ModelStore>,
+    answering: Arc<AssignService>,
     /// Twice as many as processors: one is decoded while another is solved.
     threads: Arc<Semaphore>,
 }
 
-impl Batches {
-    pub(crate) fn new(store: Arc<Store>, answering: Arc<Answering>) -> Self {
+impl ShardAssign {
+    pub(crate) fn new(store: Arc<ModelStore>, answering: Arc<AssignService>) -> Self {
         let threads = Arc::new(Semaphore::new(2 * magex_runtime::process::processors()));
         Self { store, answering, threads }
     }
 
-    /// Answers a shard with the weights of that name, as soon as they are here.
+    /// Answers a shard with the weights that it names, once they have arrived; and the method of their scheduler.
     pub(crate) async fn answer(
         &self,
         request: Arc<GoalRequest>,
         key: &WeightsKey,
-        clock: Clock,
+        budget: CallBudget,
         draining: &CancellationToken,
-    ) -> Result<GoalReply, Status> {
-        if request.scheduler != SchedulerKind::Learned {
-            return self.work(&request.clone(), clock, move |go_on| classical::assign_batch(&request, go_on)).await;
-        }
-        let wait = self.store.wait(key, PATIENCE.min(clock.left()));
+    ) -> Result<(GoalReply, AssignmentMethod), Status> {
+        let wait = self.store.wait(key, QUEUE_TIMEOUT.min(budget.left()));
         let Some(model) = draining.run_until_cancelled(wait).await.flatten() else {
             let (version, run) = (key.version, &key.run_id);
-            let problem = format!("weights version {version} of run '{run}' are not here yet");
+            let problem = format!("weights version {version} of run '{run}' have not arrived; retry later");
             return Err(status::unavailable(problem, Duration::from_millis(500)));
         };
         match model.scheduler {
             Ok(scheduler) => {
-                self.work(&request.clone(), clock, move |go_on| scheduler.assign_batch(&request, go_on)).await
+                let method = scheduler.method();
+                Ok((self.solve(request, scheduler, budget).await?, method))
             }
             Err(reason) => Err(status::failed_precondition(format!("weights version {}: {reason}", key.version))),
         }
     }
 
-    /// Runs work of the processor away from the threads that serve the network, for as long as somebody waits for it.
-    async fn work(
+    /// Runs the scheduler on a worker thread, for as long as the call waits.
+    async fn solve(
         &self,
-        request: &GoalRequest,
-        clock: Clock,
-        work: impl FnOnce(&dyn Fn() -> bool) -> Result<GoalReply, AssignError> + Send + 'static,
+        request: Arc<GoalRequest>,
+        scheduler: Arc<dyn Scheduler>,
+        budget: CallBudget,
     ) -> Result<GoalReply, Status> {
-        let patience = PATIENCE.min(clock.left());
+        let cells = request.agent_count.max(request.goal_count).pow(2);
         let places = async {
             let thread = self.threads.clone().acquire_owned().await.ok()?;
-            Some((thread, self.answering.memory(request.agent_count.max(request.goal_count).pow(2)).await?))
+            Some((thread, self.answering.memory(cells).await?))
         };
-        let Ok(Some(places)) = tokio::time::timeout(patience, places).await else {
+        let Ok(Some(places)) = tokio::time::timeout(QUEUE_TIMEOUT.min(budget.left()), places).await else {
             return Err(status::resource_exhausted("all threads are busy with other shards", Duration::from_secs(1)));
         };
-        let gone = Gone::default();
-        let flag = gone.0.clone();
-        let work = tokio::task::spawn_blocking(move || {
+        let cancel = CancelOnDrop::default();
+        let work = cancel.work(budget);
+        let solving = tokio::task::spawn_blocking(move || {
             let _held = places;
-            work(&|| !flag.load(Ordering::Relaxed) && !clock.over())
+            scheduler.assign_batch(&request, &|| work.should_continue())
         });
-        match work.await {
-            Ok(result) => result.map_err(to_status),
-            Err(error) => Err(Status::internal(error.to_string())),
-        }
+        solving.await.map_err(|error| Status::internal(error.to_string()))?.map_err(to_status)
     }
 }
 
-/// Set when the caller has gone: whatever still works for it stops.
-#[derive(Debug, Default)]
-pub(crate) struct Gone(pub(crate) Arc<AtomicBool>);
-
-impl Drop for Gone {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-/// Refuses what would take memory or time without bound. The arrays' own lengths bound the rest: they are full.
+/// Rejects requests of unbounded memory or time. The lengths of the arrays bound the rest.
 pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) -> Result<(), Status> {
     let (n, g) = (request.agent_count, request.goal_count);
     for (field, found, most) in [
@@ -113,34 +99,25 @@ pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) ->
         ("agents.shape[3]", request.dims, 3),
     ] {
         if found == 0 || found > most {
-            return Err(status::invalid_argument(field, format!("{found} is not in 1..{most}")));
+            return Err(status::invalid_argument(field, format!("{found} is outside 1..={most}")));
         }
     }
     let teams = (request.shard.episodes as usize).saturating_mul(request.stages);
     if teams > TEAMS {
-        return Err(status::invalid_argument("agents.shape", format!("{teams} teams are more than {TEAMS}")));
+        return Err(status::invalid_argument("agents.shape", format!("{teams} teams exceed the limit of {TEAMS}")));
     }
     let pairs = teams.saturating_mul(n).saturating_mul(g);
     if pairs > PAIRS {
         let problem =
-            format!("{teams} teams of {n} agents and {g} goals have more than {PAIRS} pairs; send fewer teams");
+            format!("{teams} teams of {n} agents and {g} goals exceed the limit of {PAIRS} pairs; send fewer teams");
         return Err(status::invalid_argument("agents.shape", problem));
     }
     for (field, length, most) in [("run_id", key.run_id.0.len(), RUN_ID), ("sha256", key.sha256.len(), SHA256)] {
         if length > most {
-            return Err(status::invalid_argument(field, format!("{length} bytes are more than {most}")));
+            return Err(status::invalid_argument(field, format!("{length} bytes exceed the limit of {most}")));
         }
     }
     Ok(())
-}
-
-fn to_status(error: AssignError) -> Status {
-    match error {
-        AssignError::Invalid { field, problem } => status::invalid_argument(field, problem),
-        AssignError::Unsupported(reason) => status::failed_precondition(reason),
-        AssignError::Interrupted => Status::deadline_exceeded("nobody waits for the goals any more"),
-        AssignError::Failed(reason) => Status::internal(reason),
-    }
 }
 
 #[cfg(test)]
@@ -149,7 +126,7 @@ mod tests {
     use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 
     #[test]
-    fn what_would_take_memory_or_time_without_bound_is_refused() {
+    fn requests_of_unbounded_memory_or_time_are_rejected() {
         let shard = Shard {
             kind: ShardKind::Train,
             iteration: Iteration(0),
@@ -164,7 +141,6 @@ mod tests {
         let good = GoalRequest {
             shard,
             seed: 1,
-            scheduler: SchedulerKind::Exact,
             stages: 2,
             agent_count: 200,
             goal_count: 200,
@@ -181,8 +157,8 @@ mod tests {
             (GoalRequest { agent_count: 0, ..good.clone() }, "agents.shape[2]"),
             (GoalRequest { goal_count: huge, ..good.clone() }, "goals.shape[2]"),
             (GoalRequest { dims: 0, ..good.clone() }, "agents.shape[3]"),
-            (GoalRequest { stages: huge, ..good.clone() }, "teams are more"),
-            (GoalRequest { agent_count: 5000, goal_count: 5000, ..good.clone() }, "more than 64000000 pairs"),
+            (GoalRequest { stages: huge, ..good.clone() }, "teams exceed"),
+            (GoalRequest { agent_count: 5000, goal_count: 5000, ..good.clone() }, "the limit of 64000000 pairs"),
         ] {
             let refused = check(&request, &key, &limits).unwrap_err();
             assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(words), "{refused}");

@@ -1,6 +1,7 @@
-//! Counting the calls of a gRPC service, whatever they do.
+//! Call metrics of a gRPC service: count and duration by method.
 
-use crate::metrics::{Counters, Metrics, SecondsBy};
+use crate::metrics::Metrics;
+use prometheus::{HistogramVec, IntCounterVec};
 use std::convert::Infallible;
 use std::future::Future;
 use std::pin::Pin;
@@ -10,17 +11,17 @@ use tonic::codegen::{Service, http};
 use tonic::server::NamedService;
 use tonic::{Code, Status};
 
-/// Calls of one service by method and code, and how long they took.
+/// Calls of one service by method and code, and their durations.
 #[derive(Debug, Clone)]
 pub struct Calls {
-    total: Counters,
-    seconds: SecondsBy,
+    total: IntCounterVec,
+    seconds: HistogramVec,
     methods: &'static [&'static str],
 }
 
 impl Calls {
-    /// Declares `magex_<component>_calls_total` and `magex_<component>_call_seconds`. Methods that are not among these are
-    /// counted as `other`: a caller cannot make up labels.
+    /// Declares `magex_<component>_calls_total` and `magex_<component>_call_seconds`. Methods that are not among
+    /// `methods` are counted as `other`, so that a caller cannot create labels.
     pub fn new(metrics: &Metrics, component: &str, methods: &'static [&'static str]) -> Self {
         let name = |what: &str| format!("magex_{component}_{what}");
         let total = "Calls by method and code; a stream counts when it opens.";
@@ -30,10 +31,10 @@ impl Calls {
             seconds: metrics.seconds_by(&name("call_seconds"), seconds, &["method"]),
             methods,
         };
-        // A scrape shows all of them from the start.
+        // Every method appears in a scrape from the start.
         for method in methods {
-            calls.total.with(&[method, "Ok"]).add(0);
-            drop(calls.seconds.with(&[method]));
+            calls.total.with_label_values(&[*method, "Ok"]);
+            calls.seconds.with_label_values(&[*method]);
         }
         calls
     }
@@ -82,10 +83,14 @@ where
         Box::pin(async move {
             let answer = answer.await;
             if let Ok(response) = &answer {
-                // An error has its code in the headers; a success has it behind its message.
+                // An error has its code in the headers, a success in the trailers.
                 let code = Status::from_header_map(response.headers()).map_or(Code::Ok, |status| status.code());
-                calls.total.with(&[method, &format!("{code:?}")]).add(1);
-                calls.seconds.with(&[method]).observe(start.elapsed());
+                match code {
+                    // The common case formats nothing.
+                    Code::Ok => calls.total.with_label_values(&[method, "Ok"]).inc(),
+                    code => calls.total.with_label_values(&[method, format!("{code:?}").as_str()]).inc(),
+                }
+                calls.seconds.with_label_values(&[method]).observe(start.elapsed().as_secs_f64());
             }
             answer
         })

@@ -1,35 +1,34 @@
-//! The goals that were handed out to training episodes, kept for a while so that clients can look at them.
+//! The assignments of recent training episodes, as read-only missions.
 
-use crate::scheduler::{GoalReply, GoalRequest, WeightsKey};
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use magex_core::ids::ShardKind;
 use magex_dispatch::view;
 use magex_proto::v1;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Shards that are kept, and numbers in them.
+/// Maximum number of shards, and of numbers in them.
 const SHARDS: usize = 256;
 const NUMBERS: usize = 4 << 20;
-/// Numbers that the name of a mission counts as: a page of them looks at all names.
+/// Numbers that the name of a mission counts as: every page sorts all names.
 const NAME: usize = 64;
-/// After so long nobody can call an episode live, milliseconds.
+/// How long an episode is shown, milliseconds.
 const LIVE_MS: i64 = 600_000;
 
-/// A shard's episodes and what was handed out for them.
+/// The episodes of a shard and their assignments.
 #[derive(Debug)]
 pub(crate) struct TrainingShard {
-    request: Arc<GoalRequest>,
-    reply: Arc<GoalReply>,
-    key: WeightsKey,
-    at_ms: i64,
+    pub(crate) request: Arc<GoalRequest>,
+    pub(crate) reply: Arc<GoalReply>,
+    pub(crate) key: WeightsKey,
+    /// The method of the run's scheduler.
+    pub(crate) method: AssignmentMethod,
+    /// When it was answered, milliseconds since 1970.
+    pub(crate) at_ms: i64,
 }
 
 impl TrainingShard {
-    pub(crate) fn new(request: Arc<GoalRequest>, reply: Arc<GoalReply>, key: WeightsKey, at_ms: i64) -> Self {
-        Self { request, reply, key, at_ms }
-    }
-
-    /// Number of missions: every stage of every episode is one.
+    /// Number of missions: one per stage of every episode.
     pub(crate) fn missions(&self) -> usize {
         self.request.shard.episodes as usize * self.request.stages
     }
@@ -68,7 +67,7 @@ impl TrainingShard {
             agents: request.agents.get(place * n * d..(place + 1) * n * d)?,
             goals: request.goals.get(place * g * d..(place + 1) * g * d)?,
             goal_of: reply.goals.get(place * n..(place + 1) * n)?,
-            scheduler: request.scheduler,
+            scheduler: self.method,
             version: self.key.version.0,
             sha256: &self.key.sha256,
             cost: f64::from(*reply.costs.get(place)?),
@@ -102,15 +101,15 @@ impl Episode {
 
 /// The latest shards.
 #[derive(Debug, Default)]
-pub(crate) struct Training {
+pub(crate) struct TrainingView {
     shards: Mutex<VecDeque<Arc<TrainingShard>>>,
 }
 
-impl Training {
-    /// Keeps a shard; the oldest make room.
+impl TrainingView {
+    /// Adds a shard; the oldest are dropped at the limits.
     pub(crate) fn insert(&self, shard: Arc<TrainingShard>) {
         let mut shards = self.lock();
-        // An actor that asks again gets the same answer: it is the same mission.
+        // A repeated request of an actor gets the same answer: it is the same mission.
         shards.retain(|old| old.request.shard != shard.request.shard || old.key.run_id != shard.key.run_id);
         shards.push_back(shard);
         let mut numbers: usize = shards.iter().map(|shard| shard.numbers()).sum();

@@ -1,0 +1,303 @@
+//! Answers one team: chooses the thread, enforces the deadline, and falls back to the exact method.
+//!
+//! Small teams are answered on the thread of the call: handing them to another thread costs more than the answer. Large teams
+//! are answered on worker threads, limited by processors and by memory.
+
+use crate::call_budget::CallBudget;
+use crate::cancel::CancelOnDrop;
+use crate::error::{to_status, too_late};
+use crate::metrics::CommanderMetrics;
+use crate::model_store::ModelStore;
+use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply, TeamRequest, WeightsKey};
+use magex_dispatch::mission::Planned;
+use magex_dispatch::{DispatchError, Problem, answer, engine};
+use magex_proto::v1;
+use magex_runtime::backoff::random_id;
+use magex_runtime::status;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::Status;
+
+/// How long a request waits for a processor before it is rejected.
+const QUEUE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// How long a call waits after its deadline for a worker that is about to stop.
+const LATE: Duration = Duration::from_millis(5);
+
+/// Largest team, in pairs, that exact, makespan, greedy and random answer on the thread of the call: well under a millisecond.
+const SMALL: usize = 10_000;
+
+/// The same for the learned method.
+const SMALL_LEARNED: usize = 4096;
+
+/// The model runs on the thread of the call only if its time limit is this many times its recent duration.
+const MARGIN: u32 = 4;
+
+/// Pairs per unit of memory, and number of units: one team of 5,000 × 5,000 at a time.
+const UNIT: usize = 1_000_000;
+const UNITS: usize = 26;
+
+/// Answers teams.
+#[derive(Debug)]
+pub(crate) struct AssignService {
+    store: Arc<ModelStore>,
+    pub(crate) metrics: Arc<CommanderMetrics>,
+    processors: Arc<Semaphore>,
+    memory: Arc<Semaphore>,
+    /// Recent duration of the model on a small team, nanoseconds: a maximum that decays. It only chooses the thread.
+    model_nanos: AtomicU64,
+    /// Seeds of requests without one.
+    next_seed: AtomicU64,
+}
+
+/// A processor, and memory.
+pub(crate) type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
+
+/// Where a team is answered.
+#[derive(Debug)]
+enum Route {
+    /// On the thread of the call.
+    Here,
+    /// On a worker thread.
+    Thread(Places),
+    /// On the thread of the call, by the exact method: no processor is free for the model.
+    ExactBecauseBusy,
+}
+
+impl AssignService {
+    pub(crate) fn new(store: Arc<ModelStore>, metrics: Arc<CommanderMetrics>) -> Arc<Self> {
+        let processors = Arc::new(Semaphore::new(magex_runtime::process::processors()));
+        let (memory, next_seed) = (Arc::new(Semaphore::new(UNITS)), AtomicU64::new(random_id()));
+        let model_nanos = AtomicU64::new(u64::MAX);
+        Arc::new(Self { store, metrics, processors, memory, model_nanos, next_seed })
+    }
+
+    /// A seed for a request without one.
+    pub(crate) fn seed(&self) -> u64 {
+        self.next_seed.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Answers a team on the wire.
+    pub(crate) async fn respond(
+        self: &Arc<Self>,
+        problem: Problem,
+        budget: CallBudget,
+    ) -> Result<v1::AssignResponse, Status> {
+        let budget = budget.limited(problem.deadline);
+        let problem = Arc::new(problem);
+        let planned = self.plan(&problem, budget).await?;
+        let mut response = answer::write(&problem, &planned.plan);
+        response.fallback_reason = planned.fallback_reason;
+        if let Some((version, sha256, run)) = planned.weights {
+            (response.version, response.sha256, response.run_id) = (version, sha256, run);
+        }
+        let elapsed = budget.elapsed();
+        response.seconds = elapsed.as_secs_f64();
+        self.metrics.answered(response.scheduler().into(), !response.fallback_reason.is_empty(), elapsed);
+        Ok(response)
+    }
+
+    async fn plan(self: &Arc<Self>, problem: &Arc<Problem>, budget: CallBudget) -> Result<Planned, Status> {
+        let should_continue = || !budget.over();
+        let planned = match self.route(problem, &budget).await? {
+            Route::Here => self.plan_here(problem, budget.learned(), &should_continue),
+            Route::ExactBecauseBusy => {
+                solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+            }
+            Route::Thread(places) => return self.plan_on_thread(problem, budget, Arc::new(places)).await,
+        };
+        let planned = planned.map_err(to_status)?;
+        if budget.over() { Err(too_late()) } else { Ok(planned) }
+    }
+
+    /// Chooses where a team is answered, and waits for a worker thread if it needs one.
+    async fn route(&self, problem: &Problem, budget: &CallBudget) -> Result<Route, Status> {
+        let small = problem.cells() <= SMALL;
+        if problem.scheduler != AssignmentMethod::Learned {
+            return match small {
+                true => Ok(Route::Here),
+                false => self.places(problem.cells(), budget.left()).await.map(Route::Thread),
+            };
+        }
+        if self.small_for_model(problem, budget) {
+            return Ok(Route::Here);
+        }
+        match self.places(engine::learned_cells(problem), budget.left()).await {
+            Ok(places) => Ok(Route::Thread(places)),
+            Err(_) if small => Ok(Route::ExactBecauseBusy),
+            Err(busy) => Err(busy),
+        }
+    }
+
+    /// Answers on worker threads. The learned method is abandoned at its time limit.
+    async fn plan_on_thread(
+        self: &Arc<Self>,
+        problem: &Arc<Problem>,
+        budget: CallBudget,
+        places: Arc<Places>,
+    ) -> Result<Planned, Status> {
+        let mut reason = String::new();
+        if problem.scheduler == AssignmentMethod::Learned {
+            match self.ask_on_thread(problem, budget, places.clone()).await {
+                Ok(planned) => return Ok(planned),
+                Err(why) => reason = why,
+            }
+        }
+        let cancel = CancelOnDrop::default();
+        let (problem, work) = (problem.clone(), cancel.work(budget));
+        let solving = tokio::task::spawn_blocking(move || {
+            // Held until the thread has finished, even if the call has ended.
+            let _held = places;
+            solve(&problem, reason, &|| work.should_continue())
+        });
+        tokio::select! {
+            done = solving => done.map_err(|error| Status::internal(error.to_string()))?.map_err(to_status),
+            () = tokio::time::sleep_until((budget.until() + LATE).into()) => Err(too_late()),
+        }
+    }
+
+    /// The model answers teams of this size in a fraction of its time limit.
+    fn small_for_model(&self, problem: &Problem, budget: &CallBudget) -> bool {
+        if engine::not_for_learned(problem).is_some() || self.store.latest().is_none() {
+            return problem.cells() <= SMALL;
+        }
+        let recent = Duration::from_nanos(self.model_nanos.load(Ordering::Relaxed));
+        engine::learned_cells(problem) <= SMALL_LEARNED && recent.saturating_mul(MARGIN) <= budget.learned()
+    }
+
+    /// Processors that are free for large teams.
+    pub(crate) fn free_processors(&self) -> usize {
+        self.processors.available_permits()
+    }
+
+    /// A processor, and memory for `cells` pairs.
+    pub(crate) async fn places(&self, cells: usize, timeout: Duration) -> Result<Places, Status> {
+        let both = async {
+            let memory = self.memory(cells).await?;
+            Some((self.processors.clone().acquire_owned().await.ok()?, memory))
+        };
+        match tokio::time::timeout(QUEUE_TIMEOUT.min(timeout), both).await {
+            Ok(Some(places)) => Ok(places),
+            _ => Err(status::resource_exhausted("all processors are busy; retry later", QUEUE_TIMEOUT)),
+        }
+    }
+
+    /// Waits for memory for `cells` pairs; `None` once the service has ended.
+    pub(crate) async fn memory(&self, cells: usize) -> Option<OwnedSemaphorePermit> {
+        let units = cells.div_ceil(UNIT).clamp(1, UNITS) as u32;
+        self.memory.clone().acquire_many_owned(units).await.ok()
+    }
+
+    /// Asks the learned scheduler on another thread, and cancels it at its time limit.
+    async fn ask_on_thread(
+        self: &Arc<Self>,
+        problem: &Arc<Problem>,
+        budget: CallBudget,
+        places: Arc<Places>,
+    ) -> Result<Planned, String> {
+        let (own, problem, limit) = (self.clone(), problem.clone(), budget.learned());
+        let cancel = CancelOnDrop::default();
+        let work = cancel.work(budget);
+        let answer = tokio::task::spawn_blocking(move || {
+            let _held = places;
+            own.ask_learned(&problem, &|| work.should_continue())
+        });
+        match tokio::time::timeout(limit, answer).await {
+            Ok(Ok(answer)) => answer,
+            Ok(Err(_)) => Err(MODEL_FAILED.to_owned()),
+            Err(_) => Err(exceeded(limit)),
+        }
+    }
+
+    /// Answers on this thread. The answer of a learned scheduler that exceeded `limit` is dropped.
+    pub(crate) fn plan_here(
+        &self,
+        problem: &Problem,
+        limit: Duration,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<Planned, DispatchError> {
+        let mut reason = String::new();
+        if problem.scheduler == AssignmentMethod::Learned {
+            let start = Instant::now();
+            match self.ask_learned(problem, should_continue) {
+                Ok(planned) if start.elapsed() <= limit => return Ok(planned),
+                Ok(_) => reason = exceeded(limit),
+                Err(why) => reason = why,
+            }
+        }
+        solve(problem, reason, should_continue)
+    }
+
+    /// The learned answer, or the reason for a fallback.
+    fn ask_learned(&self, problem: &Problem, should_continue: &dyn Fn() -> bool) -> Result<Planned, String> {
+        if let Some(reason) = engine::not_for_learned(problem) {
+            return Err(reason.to_owned());
+        }
+        let Some((key, scheduler)) = self.store.latest() else {
+            return Err("no model is loaded".to_owned());
+        };
+        // The call may have ended before a thread was free.
+        if !should_continue() {
+            return Err("the deadline passed before the model was called".to_owned());
+        }
+        let start = Instant::now();
+        let reply = ask(problem, scheduler.as_ref());
+        if engine::learned_cells(problem) <= SMALL_LEARNED {
+            let nanos = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
+            let before = self.model_nanos.load(Ordering::Relaxed);
+            let before = if before == u64::MAX { 0 } else { before - before / 8 };
+            self.model_nanos.store(nanos.max(before), Ordering::Relaxed);
+        }
+        let reply = reply?;
+        // The rest is work only for a call that still waits.
+        if !should_continue() {
+            return Err("the model answered after the deadline".to_owned());
+        }
+        let plan = engine::adopt(problem, reply.goals, reply.probabilities, should_continue)?;
+        Ok(Planned { plan, fallback_reason: String::new(), weights: Some(names(&key)) })
+    }
+}
+
+const MODEL_FAILED: &str = "the model failed with an internal error";
+
+/// Solves by the requested method; the exact one answers in place of the learned one, for `fallback_reason`.
+fn solve(
+    problem: &Problem,
+    fallback_reason: String,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Planned, DispatchError> {
+    let method = match problem.scheduler {
+        AssignmentMethod::Learned => AssignmentMethod::Exact,
+        other => other,
+    };
+    let plan = engine::solve(problem, method, should_continue)?;
+    Ok(Planned { plan, fallback_reason, weights: None })
+}
+
+fn ask(problem: &Problem, scheduler: &dyn Scheduler) -> Result<TeamReply, String> {
+    let request = TeamRequest {
+        agent_count: problem.agent_count,
+        goal_count: problem.goal_count,
+        dims: problem.dims,
+        agents: problem.agents.clone(),
+        goals: problem.goals.clone(),
+        mode: problem.mode,
+        seed: problem.seed,
+    };
+    // A panic of the model must not end the service.
+    match catch_unwind(AssertUnwindSafe(|| scheduler.assign_team(&request))) {
+        Ok(reply) => reply.map_err(|error| error.to_string()),
+        Err(_) => Err(MODEL_FAILED.to_owned()),
+    }
+}
+
+fn names(key: &WeightsKey) -> (u32, String, String) {
+    (key.version.0, key.sha256.clone(), key.run_id.0.clone())
+}
+
+fn exceeded(limit: Duration) -> String {
+    format!("the model exceeded its time limit of {limit:.1?}")
+}

@@ -1,0 +1,78 @@
+//! The commander's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
+
+use crate::scheduler::AssignmentMethod;
+use magex_runtime::metrics::{Gauge, HistogramVec, IntCounter, IntCounterVec, Metrics};
+use magex_runtime::net::call_metrics::Calls;
+use std::time::Duration;
+
+/// Methods of the service; the label of a metric.
+const METHODS: [&str; 11] = [
+    "Assign",
+    "AssignMany",
+    "AssignStream",
+    "AssignBatch",
+    "CreateMission",
+    "UpdateMission",
+    "GetAssignment",
+    "ListAssignments",
+    "WatchAssignments",
+    "DeleteMission",
+    "GetModel",
+];
+
+/// The commander's metrics.
+#[derive(Debug)]
+pub(crate) struct CommanderMetrics {
+    pub(crate) calls: Calls,
+    answers: IntCounterVec,
+    answer_seconds: HistogramVec,
+    fallbacks: IntCounter,
+    pub(crate) in_flight: Gauge,
+    pub(crate) streams: Gauge,
+    pub(crate) missions: Gauge,
+    pub(crate) weights_version: Gauge,
+    pub(crate) free_processors: Gauge,
+    pub(crate) backlog: Gauge,
+}
+
+impl CommanderMetrics {
+    /// Declares them.
+    pub(crate) fn new(m: &Metrics) -> Self {
+        let metrics = Self {
+            calls: Calls::new(m, "commander", &METHODS),
+            answers: m.counters(
+                "magex_commander_answers_total",
+                "Teams and shards answered, by method.",
+                &["scheduler"],
+            ),
+            answer_seconds: m.seconds_by(
+                "magex_commander_answer_seconds",
+                "From a request to its answer, by method.",
+                &["scheduler"],
+            ),
+            fallbacks: m
+                .counter("magex_commander_fallbacks_total", "Answers by another method than the requested one."),
+            in_flight: m.gauge("magex_commander_inflight_calls", "Calls in flight."),
+            streams: m.gauge("magex_commander_open_streams", "Open streams."),
+            missions: m.gauge("magex_commander_missions", "Missions of clients."),
+            weights_version: m
+                .gauge("magex_commander_weights_version", "Version of the newest usable model; -1 without one."),
+            free_processors: m.gauge("magex_commander_free_processors", "Processors free for large teams."),
+            backlog: m.gauge("magex_commander_queue_messages", "Events that the slowest watcher has not received."),
+        };
+        // Every method appears in a scrape from the start.
+        for method in AssignmentMethod::ALL {
+            metrics.answers.with_label_values(&[method.name()]);
+            metrics.answer_seconds.with_label_values(&[method.name()]);
+        }
+        metrics.weights_version.set(-1.0);
+        metrics
+    }
+
+    /// Counts an answer.
+    pub(crate) fn answered(&self, by: AssignmentMethod, fallback: bool, elapsed: Duration) {
+        self.answers.with_label_values(&[by.name()]).inc();
+        self.answer_seconds.with_label_values(&[by.name()]).observe(elapsed.as_secs_f64());
+        self.fallbacks.inc_by(u64::from(fallback));
+    }
+}

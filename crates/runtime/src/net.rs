@@ -1,0 +1,36 @@
+//! The path of a connection and of a call, from the socket to the handler.
+//!
+//! ```text
+//!  listener
+//!     │ accept                                                          [connections]
+//!     │   total and per-peer limit; at the limit the connection that has waited longest is evicted
+//!     │   no call within `first_call`, handshakes included: the connection is closed
+//!     ▼
+//!  TLS and HTTP/2 (tonic)
+//!     ▼
+//!  Counted              calls and seconds by method and code            [call_metrics]
+//!     ▼
+//!  Guard                from the headers alone                          [guard]
+//!     │   Guarded: authenticate by token or certificate                 [auth]
+//!     │            mark the connection as `Called`: it is no longer evicted
+//!     │   Public:  (health, reflection) the caller is its address; the connection is `Probed`
+//!     │   both:    take a `Permit`: calls or streams of the caller      [in_flight]
+//!     │   body:    the length of every message is counted before the message is read
+//!     ▼
+//!  WithDeadline         `grpc-timeout` becomes a `Deadline`             [deadline]
+//!     ▼
+//!  decoding, then the handler: `auth::caller` checks the role
+//!     │
+//!     ▼
+//!  response             status texts are cut to what clients accept; the permit is released with the last frame
+//! ```
+//!
+//! Codes: UNAUTHENTICATED for unknown credentials, RESOURCE_EXHAUSTED with a retry delay for a limit, UNAVAILABLE while the
+//! service drains, DEADLINE_EXCEEDED for a deadline or a message that does not arrive, PERMISSION_DENIED for a role.
+
+pub mod auth;
+pub mod call_metrics;
+pub mod connections;
+pub mod deadline;
+pub mod guard;
+pub mod in_flight;

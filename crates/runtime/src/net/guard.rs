@@ -1,0 +1,277 @@
+//! The layer in front of a service: it authenticates a call, counts what the caller has in flight, and counts messages while
+//! they arrive. It decides from the headers of a call and the announced length of a message, before anything is decoded.
+
+mod truncate_status;
+
+use crate::net::auth::{Access, Caller, Role, peer_address};
+use crate::net::connections::Connections;
+use crate::net::in_flight::{CallKind, InFlight, Permit};
+use http_body::{Frame, SizeHint};
+use std::convert::Infallible;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+use tokio::time::Sleep;
+use tonic::Status;
+use tonic::body::Body;
+use tonic::codegen::{Service, http};
+use tonic::server::NamedService;
+use truncate_status::truncate_status;
+
+/// Timeout of a message of a stream, from its first byte to its last, and of the whole request of a unary call.
+const MESSAGE: Duration = Duration::from_secs(30);
+
+/// Bytes before every message: a compression flag and the length.
+const PREFIX: usize = 5;
+
+/// Longest message to a public service, bytes: the name of a service or of a symbol.
+const ANONYMOUS_MESSAGE: usize = 4096;
+
+/// Streaming methods of public services.
+const ANONYMOUS_STREAMS: &[&str] = &["Watch", "ServerReflectionInfo"];
+
+/// The rules of a guarded service.
+#[derive(Debug)]
+pub struct Rules {
+    /// The identities that may call.
+    pub access: Access,
+    /// Limits of what callers have in flight.
+    pub in_flight: Arc<InFlight>,
+    /// Streaming methods.
+    pub streams: &'static [&'static str],
+    /// Longest message, bytes; the service itself rejects longer ones.
+    pub message_bytes: usize,
+}
+
+/// Which calls a [`Guard`] accepts.
+#[derive(Debug)]
+enum Policy {
+    /// Calls with credentials, within the caller's limits.
+    Guarded(Rules),
+    /// Calls of any client (health, reflection), within limits per address, also while the service drains.
+    Public,
+}
+
+/// A service behind a guard.
+#[derive(Debug, Clone)]
+pub struct Guard<S> {
+    service: S,
+    policy: Arc<Policy>,
+    connections: Connections,
+}
+
+impl<S> Guard<S> {
+    /// Requires credentials and enforces the limits of `rules`.
+    pub fn guarded(service: S, rules: Rules, connections: Connections) -> Self {
+        Self { service, policy: Arc::new(Policy::Guarded(rules)), connections }
+    }
+
+    /// Accepts any client, within small limits per address.
+    pub fn public(service: S, connections: Connections) -> Self {
+        Self { service, policy: Arc::new(Policy::Public), connections }
+    }
+
+    fn admit(&self, mut request: http::Request<Body>) -> Result<(http::Request<Body>, Arc<Permit>), Status> {
+        let address = peer_address(request.extensions());
+        let (permit, kind, limit) = match &*self.policy {
+            Policy::Guarded(rules) => {
+                let caller = rules.access.authenticate(&request)?;
+                if let Some(address) = address {
+                    self.connections.called(address);
+                }
+                let kind = kind(request.uri(), rules.streams);
+                let permit = rules.in_flight.acquire(&caller, kind)?;
+                request.extensions_mut().insert(caller);
+                (permit, kind, Limit { bytes: rules.message_bytes, strict: false })
+            }
+            Policy::Public => {
+                if let Some(address) = address {
+                    self.connections.probed(address);
+                }
+                let name = address.map_or_else(|| "local".to_owned(), |address| address.ip().to_string());
+                let caller = Caller { name: name.into(), role: Role::Client };
+                let kind = kind(request.uri(), ANONYMOUS_STREAMS);
+                let permit = self.connections.anonymous().acquire(&caller, kind)?;
+                (permit, kind, Limit { bytes: ANONYMOUS_MESSAGE, strict: true })
+            }
+        };
+        let permit = Arc::new(permit);
+        let metered = permit.clone();
+        Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, limit))), permit))
+    }
+}
+
+impl<S: NamedService> NamedService for Guard<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+type Answer = Pin<Box<dyn Future<Output = Result<http::Response<Body>, Infallible>> + Send>>;
+
+impl<S> Service<http::Request<Body>> for Guard<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
+    S::Future: Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = Answer;
+
+    fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(cx)
+    }
+
+    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        let (request, permit) = match self.admit(request) {
+            Ok(admitted) => admitted,
+            Err(status) => return Box::pin(std::future::ready(Ok(status.into_http()))),
+        };
+        let answer = self.service.call(request);
+        Box::pin(async move {
+            let mut response = answer.await?;
+            truncate_status(response.headers_mut());
+            Ok(response.map(|body| Body::new(Permitted { body, _permit: permit })))
+        })
+    }
+}
+
+fn kind(uri: &http::Uri, streams: &[&str]) -> CallKind {
+    let method = uri.path().rsplit('/').next().unwrap_or_default();
+    if streams.contains(&method) { CallKind::Stream } else { CallKind::Call }
+}
+
+/// The limit of a message's length.
+#[derive(Debug, Clone, Copy)]
+struct Limit {
+    bytes: usize,
+    /// Longer messages are rejected here. Otherwise the service rejects them itself, without buffering them.
+    strict: bool,
+}
+
+/// A request's body whose messages are counted while they arrive.
+struct Metered {
+    body: Body,
+    permit: Arc<Permit>,
+    limit: Limit,
+    kind: CallKind,
+    prefix: [u8; PREFIX],
+    /// Bytes of the prefix that have arrived, and bytes of the message that have not.
+    known: usize,
+    rest: usize,
+    /// The next bytes must arrive within [`MESSAGE`].
+    timed: bool,
+    timeout: Option<Pin<Box<Sleep>>>,
+}
+
+impl Metered {
+    fn new(body: Body, permit: Arc<Permit>, kind: CallKind, limit: Limit) -> Self {
+        // A stream may be silent before and between messages.
+        let timed = kind == CallKind::Call;
+        Self { body, permit, limit, kind, prefix: [0; PREFIX], known: 0, rest: 0, timed, timeout: None }
+    }
+
+    fn count(&mut self, mut data: &[u8]) -> Result<(), Status> {
+        while !data.is_empty() {
+            if self.rest > 0 {
+                let step = self.rest.min(data.len());
+                (self.rest, data) = (self.rest - step, &data[step..]);
+                if self.rest == 0 {
+                    // The next message has its own timeout.
+                    self.timeout = None;
+                }
+            } else {
+                let step = (PREFIX - self.known).min(data.len());
+                self.prefix[self.known..self.known + step].copy_from_slice(&data[..step]);
+                (self.known, data) = (self.known + step, &data[step..]);
+                if self.known == PREFIX {
+                    let [_, a, b, c, d] = self.prefix;
+                    (self.known, self.rest) = (0, u32::from_be_bytes([a, b, c, d]) as usize);
+                    if self.rest <= self.limit.bytes {
+                        self.permit.reserve(self.rest)?;
+                    } else if self.limit.strict {
+                        let (length, limit) = (self.rest, self.limit.bytes);
+                        return Err(Status::out_of_range(format!(
+                            "message of {length} bytes exceeds the limit of {limit}"
+                        )));
+                    }
+                    if self.rest == 0 {
+                        self.timeout = None;
+                    }
+                }
+            }
+        }
+        self.timed = self.kind == CallKind::Call || self.rest > 0 || self.known > 0;
+        if !self.timed {
+            self.timeout = None;
+        }
+        Ok(())
+    }
+}
+
+impl http_body::Body for Metered {
+    type Data = tonic::codegen::Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
+        let next = Pin::new(&mut self.body).poll_frame(cx);
+        match &next {
+            Poll::Ready(Some(Ok(frame))) => {
+                if let Some(data) = frame.data_ref()
+                    && let Err(status) = self.count(data)
+                {
+                    return Poll::Ready(Some(Err(status)));
+                }
+            }
+            Poll::Pending if self.timed => {
+                let timeout = self.timeout.get_or_insert_with(|| Box::pin(tokio::time::sleep(MESSAGE)));
+                if timeout.as_mut().poll(cx).is_ready() {
+                    let problem = format!("the message did not arrive within {} s", MESSAGE.as_secs());
+                    return Poll::Ready(Some(Err(Status::deadline_exceeded(problem))));
+                }
+            }
+            _ => {}
+        }
+        next
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// A response's body that holds the permit until its last frame is sent.
+struct Permitted {
+    body: Body,
+    _permit: Arc<Permit>,
+}
+
+impl http_body::Body for Permitted {
+    type Data = tonic::codegen::Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
+        let mut next = Pin::new(&mut self.body).poll_frame(cx);
+        if let Poll::Ready(Some(Ok(frame))) = &mut next
+            && let Some(trailers) = frame.trailers_mut()
+        {
+            truncate_status(trailers);
+        }
+        next
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests;

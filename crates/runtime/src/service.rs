@@ -1,0 +1,112 @@
+//! The start and the end of a service process, in one order for every service: process limits, runtime, telemetry, signals,
+//! sockets, the ready line, the service itself, the last traces.
+
+use crate::exit::{self, Failure};
+use crate::http::{HttpArgs, Page, Router};
+use crate::net::connections::ConnectionLimits;
+use crate::server::{self, BindError, Incoming};
+use crate::telemetry::{self, LogFormat, TraceArgs};
+use crate::{process, shutdown};
+use clap::Args;
+use serde::Serialize;
+use std::net::SocketAddr;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+/// Options of every service.
+#[derive(Debug, Clone, Default, Args, Serialize)]
+pub struct ServiceArgs {
+    /// Metrics and pages for operators
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub http: HttpArgs,
+    /// Export of traces
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub traces: TraceArgs,
+    /// Format of log lines
+    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
+    #[serde(skip)]
+    pub log_format: LogFormat,
+    /// Print the configuration in effect and exit
+    #[arg(long)]
+    #[serde(skip)]
+    pub print_config: bool,
+    /// Check the health of the running service with these options and exit: 0 healthy, 1 not (of an actor, at --http)
+    #[arg(long)]
+    #[serde(skip)]
+    pub health_check: bool,
+}
+
+/// What a running service gets from [`main`].
+#[derive(Debug)]
+pub struct Context {
+    /// Cancelled by the first SIGINT or SIGTERM.
+    pub stop: CancellationToken,
+    name: &'static str,
+    address: Option<SocketAddr>,
+    page: Option<Page>,
+}
+
+impl Context {
+    /// Binds the service's address.
+    ///
+    /// # Errors
+    /// The address is malformed or in use.
+    pub async fn listen(&mut self, listen: &str, limits: ConnectionLimits) -> Result<(Incoming, SocketAddr), Failure> {
+        let (incoming, address) = server::bind(listen).await.map_err(unavailable)?;
+        self.address = Some(address);
+        Ok((incoming.within(limits), address))
+    }
+
+    /// Whether there is an HTTP server for operators.
+    pub fn has_page(&self) -> bool {
+        self.page.is_some()
+    }
+
+    /// Prints the ready line, and serves `routes` on the operators' address if there is one.
+    pub fn announce(&mut self, routes: Router) -> Option<JoinHandle<()>> {
+        process::announce_ready(self.name, self.address, self.page.as_ref().map(Page::address));
+        self.page.take().map(|page| page.serve(routes, self.stop.clone()))
+    }
+}
+
+/// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines; traces have it with the
+/// prefix `magex-`.
+///
+/// # Errors
+/// Wrong usage, a socket that cannot be bound, and what `run` returns.
+pub fn main<T>(
+    name: &'static str,
+    threads: usize,
+    args: &ServiceArgs,
+    run: impl AsyncFnOnce(Context) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    process::allow_open_files();
+    process::disable_huge_pages();
+    let internal = |error| Failure::new(exit::INTERNAL, error);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(threads)
+        .thread_name("magex-net")
+        .enable_all()
+        .build()
+        .map_err(internal)?;
+    let telemetry = {
+        let _runtime = runtime.enter();
+        telemetry::init(&format!("magex-{name}"), args.log_format, &args.traces).map_err(Failure::usage)?
+    };
+    process::log_environment();
+    let result = runtime.block_on(async {
+        let stop = shutdown::on_signal().map_err(internal)?;
+        let page = args.http.bind().await.map_err(unavailable)?;
+        run(Context { stop, name, address: None, page }).await
+    });
+    telemetry.flush();
+    // A thread that still works must not delay the end.
+    runtime.shutdown_background();
+    result
+}
+
+fn unavailable(error: BindError) -> Failure {
+    Failure::new(exit::UNAVAILABLE, error)
+}
