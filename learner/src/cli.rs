@@ -1,7 +1,6 @@
 //! The learner's command line.
 
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::page::{LivePage, RunInfo};
 use crate::run_folder::Standing;
 use crate::run_identity::RunIdentity;
 use crate::serve::service::{LearnerHandle, learner_service};
@@ -18,6 +17,7 @@ use magex_runtime::http::{HttpArgs, Page};
 use magex_runtime::security::ServerArgs;
 use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
 use magex_runtime::{process, server, shutdown};
+use magex_viewer::page::{LivePage, RunInfo};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

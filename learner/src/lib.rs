@@ -8,16 +8,13 @@
 //! | [`report`] | what a run writes for people: metrics.jsonl, summary.json, event files |
 //! | [`collector`], [`run_events`] | the seam between the training loop and the service |
 //! | [`checkpoint`] | what a resume needs |
-//! | [`page`] | the live page |
 //! | [`cli`] | the command line of `magex-learner` |
 
-pub mod bench;
 pub mod checkpoint;
 pub mod cli;
 pub mod collector;
 #[cfg(test)]
 mod fixtures;
-pub mod page;
 pub mod report;
 pub mod run_events;
 mod run_folder;

@@ -5,7 +5,6 @@ mod saving;
 
 use crate::checkpoint::{self, CheckpointError, Learned, Progress, sha256_hex};
 use crate::collector::Collector;
-use crate::page::{LivePage, Phase};
 use crate::report::metrics_file::{EvalSummary, IterationMetrics, MetricsFile, Summary, Timing, summarise};
 use crate::report::tensorboard::EventFile;
 use crate::run_events::{CollectError, IterationReport, RunEvent, StopReason};
@@ -19,6 +18,7 @@ use magex_nets::commander::CommanderError;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
+use magex_viewer::page::{LivePage, Phase, RunEnd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -209,7 +209,13 @@ impl Trainer {
     /// Trains until the target is reached, the budget is spent, or somebody asks to stop.
     pub fn run(&mut self, collector: &mut dyn Collector) -> Result<Outcome, TrainError> {
         let outcome = self.train(collector);
-        self.tell(|page| page.ended(&outcome));
+        self.tell(|page| {
+            page.ended(match &outcome {
+                Ok(Outcome::Finished(summary)) => RunEnd::Finished(serde_json::to_value(summary).unwrap_or_default()),
+                Ok(Outcome::Stopped(reason)) => RunEnd::Stopped(reason.to_string()),
+                Err(error) => RunEnd::Failed(error.to_string()),
+            });
+        });
         outcome
     }
 

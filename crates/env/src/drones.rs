@@ -8,10 +8,9 @@
 //! reward and the handling of crashes are this crate's, see [`Drones`].
 
 pub mod control;
+pub mod linalg;
 pub mod model;
-
-pub(crate) mod linalg;
-pub(crate) mod world;
+pub mod world;
 
 mod engine;
 mod episode;

@@ -1,16 +1,15 @@
 //! The particle tasks Simple Spread and Push Ball (paper, section 5.1.1): physics, spawn, reward, metrics, the scripted
-//! controllers used as yardsticks, and the check of all of it against recordings of the authors' simulator.
+//! controllers used as yardsticks.
 //!
 //! An [`Env`] is a batch of B independent episodes stepped together, one world per SIMD lane. An episode is a pure
 //! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and
 //! on any machine.
 //!
-//! No networks, no threads, no clock (except in [`mod@bench`], which measures).
+//! No networks, no threads, no clock. `magex-verify` checks all of it against recordings of the authors' simulator.
 
-pub mod bench;
 pub mod drones;
-pub mod golden;
 pub mod layouts;
+pub mod physics;
 pub mod push_ball;
 pub mod scripted;
 pub mod spawn;
@@ -21,7 +20,6 @@ mod cells;
 mod env;
 mod error;
 mod matching;
-mod physics;
 mod real;
 mod spread;
 mod swarm;
