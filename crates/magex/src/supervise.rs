@@ -26,7 +26,7 @@ const LIVES: u32 = 4;
 
 /// How a training run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum RunEnd {
+pub(crate) enum TrainEnd {
     /// Target reached or budget spent; summary.json exists.
     Finished,
     /// Stopped before the end; the run can be resumed.
@@ -56,7 +56,7 @@ pub(crate) struct ServicesPlan<'a> {
 }
 
 /// Trains on services of this machine until the run is complete or interrupted.
-pub(crate) fn run(plan: &ServicesPlan<'_>, progress: &mut Progress) -> anyhow::Result<RunEnd> {
+pub(crate) fn run(plan: &ServicesPlan<'_>, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
     let logs = plan.folder.join("logs");
     std::fs::create_dir_all(&logs).with_context(|| logs.display().to_string())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
@@ -65,7 +65,7 @@ pub(crate) fn run(plan: &ServicesPlan<'_>, progress: &mut Progress) -> anyhow::R
     end
 }
 
-async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress) -> anyhow::Result<RunEnd> {
+async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
     let interrupted = shutdown::on_signal()?;
     let (out, threads) = (plan.folder.display().to_string(), plan.threads.to_string());
     let learner = |listen: &str, http: Option<&str>| {
@@ -113,8 +113,8 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
                 let status = status?;
                 let (code, reason) = (code_of(status), running.failure(status));
                 match code {
-                    Some(exit::OK) => break Ok(RunEnd::Finished),
-                    Some(exit::TEMPORARY) => break Ok(RunEnd::Stopped),
+                    Some(exit::OK) => break Ok(TrainEnd::Finished),
+                    Some(exit::TEMPORARY) => break Ok(TrainEnd::Stopped),
                     _ => lives -= 1,
                 }
                 if lives == 0 || code.is_some_and(|code| [exit::USAGE, exit::CANNOT_CREATE].contains(&code)) {

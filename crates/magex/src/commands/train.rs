@@ -8,7 +8,7 @@ use crate::options::CommonOptions;
 use crate::output::{Output, note, program, seconds, share, thousands};
 use crate::progress::Progress;
 use crate::settings::{self, Overrides};
-use crate::supervise::{self, ActorPlan, RunEnd, ServicesPlan};
+use crate::supervise::{self, ActorPlan, ServicesPlan, TrainEnd};
 use anyhow::Context as _;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
@@ -98,8 +98,8 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
         tracing::warn!("no curve.svg: {error:#}");
     }
     match end {
-        RunEnd::Finished => report_finished(&plan, started, &progress, output),
-        RunEnd::Stopped => Ok(report_stopped(&plan, output)),
+        TrainEnd::Finished => report_finished(&plan, started, &progress, output),
+        TrainEnd::Stopped => Ok(report_stopped(&plan, output)),
     }
 }
 
@@ -182,7 +182,7 @@ fn prepare(args: &TrainArgs, config: RunConfig) -> anyhow::Result<Plan> {
 
 // --- Run --------------------------------------------------------------------------------------------------------------
 
-fn train(plan: &Plan, progress: &mut Progress) -> anyhow::Result<RunEnd> {
+fn train(plan: &Plan, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
     // With services too, the run is created or checked here: errors reach the terminal instead of a log file, and the
     // learner process always continues from a checkpoint.
     let trainer = open(plan)?;
@@ -214,7 +214,7 @@ fn open(plan: &Plan) -> Result<Trainer, TrainError> {
 }
 
 /// Learner, commander and rollouts as threads of this process.
-fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) -> anyhow::Result<RunEnd> {
+fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let stop = Arc::new(AtomicBool::new(false));
     let (signal, flag) = (runtime.block_on(async { shutdown::on_signal() })?, stop.clone());
@@ -254,8 +254,8 @@ fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) 
         let _ = runtime.block_on(serving);
     }
     match outcome? {
-        Outcome::Finished(_) => Ok(RunEnd::Finished),
-        Outcome::Stopped(_) => Ok(RunEnd::Stopped),
+        Outcome::Finished(_) => Ok(TrainEnd::Finished),
+        Outcome::Stopped(_) => Ok(TrainEnd::Stopped),
     }
 }
 
