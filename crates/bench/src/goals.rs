@@ -1,4 +1,4 @@
-//! How good the commanders' assignments are: summed distance over the least possible, on instances never trained on.
+//! `commander`, `ranking`: cost of the commanders' assignments over the exact cost, on unseen instances.
 
 use crate::report::Report;
 use anyhow::Context as _;

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 /// Options of `soak`.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct SoakArgs {
-    /// Minutes that count.
+    /// Minutes that are measured.
     #[arg(long, value_name = "M", default_value_t = 60, value_parser = settings::count)]
     minutes: u32,
     /// Minutes before that, in which caches and histories fill.
@@ -35,7 +35,7 @@ pub(crate) struct SoakArgs {
     keep: Keep,
 }
 
-/// One look at a process.
+/// One sample of a process.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     hours: f64,

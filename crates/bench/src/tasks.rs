@@ -1,4 +1,4 @@
-//! Push Ball and the drones: every task trained as its configuration says, then measured on its own starts and on others.
+//! `tasks`: Push Ball and the drones trained with their configurations, then evaluated on their own and on other starts.
 
 use crate::report::Report;
 use crate::runs::{Keep, magex, number, strings};

@@ -1,4 +1,4 @@
-//! The result table: every team size, executor and seed trained and evaluated.
+//! `train`: the result table, every team size, executor and seed trained and evaluated.
 
 use crate::report::Report;
 use crate::runs::{Keep, magex, number, strings};
@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 /// Options of `train`.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct TrainArgs {
-    /// Configuration of every run; team size, executor and seed are set all the same.
+    /// Configuration of every run; team size, executor and seed are overridden.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Folder with spread-<N>-<executor>.toml or spread-<N>.toml; what is not there takes the defaults.
+    /// Folder with spread-<N>-<executor>.toml or spread-<N>.toml; without a file, the defaults.
     #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
     configs: PathBuf,
     /// Team sizes.

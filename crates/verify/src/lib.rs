@@ -27,7 +27,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
-/// Why a folder could not be walked.
+/// A folder that cannot be read.
 #[derive(Debug, Error)]
 #[error("{path}: {source}")]
 pub struct VerifyError {
@@ -51,7 +51,7 @@ pub enum Outcome {
 pub struct FileReport {
     /// Relative to the folder that was checked.
     pub path: PathBuf,
-    /// What the file says it is; empty if it does not say.
+    /// Format that the file names; empty if it names none.
     pub format: String,
     /// What was compared, for example `N = 50, 120 steps`.
     pub content: String,
@@ -235,7 +235,7 @@ impl fmt::Display for VerifyReport {
                 Outcome::Skipped(reason) => writeln!(f, "  skipped: {reason}")?,
                 Outcome::Fails(reasons) => {
                     writeln!(f)?;
-                    // The first few say what is wrong; a thousand would hide the table.
+                    // The first reasons suffice; a thousand would hide the table.
                     for reason in reasons.iter().take(5) {
                         writeln!(f, "      {reason}")?;
                     }

@@ -1,5 +1,4 @@
-//! A replay to look at: one HTML file with everything inside, opened by a double click. What it draws is a
-//! [`Scene`], like the episode on the learner's live page.
+//! A replay: one self-contained HTML file. It draws a [`Scene`], like the episode on the live page.
 
 use crate::scene::{PackedEpisode, SCRIPT, Scene};
 use magex_core::task::TaskConfig;
@@ -27,7 +26,7 @@ pub enum ReplayError {
     },
 }
 
-/// What a page says besides the episodes, and what its script needs to know.
+/// Texts of a page, and the sizes that its script needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayInfo {
     /// Headline, for example the run's name.
@@ -52,11 +51,11 @@ pub struct ReplayEpisode<'a> {
     pub name: String,
     /// The states.
     pub recording: &'a Recording,
-    /// What it scored, if that is known; shown beside the numbers the page computes.
+    /// Its scores, if known; shown beside the numbers that the page computes.
     pub metrics: Option<EpisodeMetrics>,
 }
 
-/// What the page's script reads.
+/// The data that the script of the page reads.
 #[derive(Serialize)]
 struct Page<'a> {
     title: &'a str,
@@ -85,7 +84,7 @@ pub fn replay_html(info: &ReplayInfo, episodes: &[ReplayEpisode<'_>]) -> Result<
         field: "page",
         reason: error.to_string(),
     })?;
-    // Nothing is replaced inside the data. A `<` could end the script element early.
+    // Placeholders are replaced outside the data only. A `<` in the data could end the script element early.
     let title = info.title.replace('&', "&amp;").replace('<', "&lt;");
     let (head, tail) = PAGE.split_once("@DATA@").unwrap_or((PAGE, ""));
     let tail = tail.replacen("@SCENE@", SCRIPT, 1);
@@ -176,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_drawn_is_refused_by_name() {
+    fn recordings_that_cannot_be_drawn_are_rejected_by_field() {
         let refuse = |change: fn(&mut Recording)| {
             let mut bad = recording();
             change(&mut bad);
@@ -194,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn agent_state_are_packed_and_checked_like_positions() {
+    fn agent_state_is_packed_and_checked_like_positions() {
         let recording = in_space();
         let data = data(&page_of(TaskName::Drones, "drones", &recording).unwrap());
         let episode = &data["episodes"][0];

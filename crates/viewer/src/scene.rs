@@ -1,5 +1,5 @@
-//! A recorded episode as a page draws it: sizes of the task and packed states. The drawing itself is [`SCRIPT`], which the
-//! live page and the replay files share.
+//! A recorded episode as a page draws it: sizes of the task and packed states. [`SCRIPT`] draws it, on the live page and in
+//! replay files.
 //!
 //! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
 //! and knows no task by name; three dimensions are seen from above, from the side and in space.
@@ -29,11 +29,11 @@ pub struct SceneError {
 pub struct Scene {
     /// Side of the map, which is centred on the origin.
     pub side: f32,
-    /// What a world unit is called, in the plural.
+    /// Plural name of the length unit.
     pub length_unit: &'static str,
-    /// What an agent is called.
+    /// Display name of an agent.
     pub agent_name: &'static str,
-    /// What an agent is that is out of the episode.
+    /// Display name of the state of an agent that has left the episode.
     pub out_name: &'static str,
     /// Radius of an agent.
     pub agent_radius: f32,
@@ -52,11 +52,11 @@ pub struct Scene {
     /// The groups from the agents to the landmarks, K + 1 of them: the k-th goal of an agent is a member of entry k + 1.
     #[serde(serialize_with = "group_names")]
     pub chain: Vec<Group>,
-    /// Which of an agent's agent_state begin its target velocity.
+    /// Index in `agent_state` where an agent's target velocity begins.
     pub target_velocity: Option<usize>,
-    /// Which of an agent's agent_state are x and y of its upward axis; the first of the two.
+    /// Index in `agent_state` of x of an agent's upward axis; y follows.
     pub up: Option<usize>,
-    /// Which of an agent's agent_state says (by 1) that it crashed: it covers nothing any more.
+    /// Index in `agent_state` that is 1 once an agent has crashed; a crashed agent covers no landmark.
     pub out: Option<usize>,
     /// [`UNIT`].
     pub unit: f64,
@@ -92,7 +92,7 @@ impl Scene {
         }
     }
 
-    /// How many of an agent's agent_state the script reads.
+    /// Length of `agent_state` that the script reads.
     pub fn agent_state(&self) -> usize {
         let ends = [self.target_velocity.map(|x| x + 3), self.up.map(|x| x + 2), self.out.map(|x| x + 1)];
         ends.into_iter().flatten().max().unwrap_or(0)
@@ -133,7 +133,7 @@ impl Scene {
         let shape = &recording.shape;
         let wrong = |field, reason| SceneError { field, reason };
         if shape.agents == 0 || shape.dims == 0 || shape.goals_per_agent == 0 || shape.bodies < shape.agents {
-            let reason = "agents, dims and targets must be at least 1 and bodies as many as agents";
+            let reason = "agents, dims and goals_per_agent must be at least 1, and bodies at least agents";
             return Err(wrong("shape", reason.to_owned()));
         }
         if shape.goals_per_agent + 1 != self.chain.len() {
@@ -183,7 +183,7 @@ impl Scene {
         Ok(wide)
     }
 
-    /// What an episode scored, in words.
+    /// The scores of an episode as labels and text.
     pub fn facts(&self, metrics: &EpisodeMetrics) -> Vec<(&'static str, String)> {
         let known = [
             ("success at the start", Some(metrics.spawn_success)),
@@ -222,7 +222,7 @@ pub struct PackedEpisode<'a> {
     facts: Vec<(&'static str, String)>,
 }
 
-/// What the script calls a group.
+/// Name of a group in the script.
 fn group_name(group: Group) -> &'static str {
     match group {
         Group::Agents => "agents",

@@ -86,7 +86,7 @@ pub(super) async fn saturate(
     Ok(calls as f64 / start.elapsed().as_secs_f64())
 }
 
-/// What a flood did.
+/// Result of a flood.
 pub(super) struct Flood {
     pub(super) answered: u64,
     pub(super) exhausted: u64,

@@ -63,7 +63,7 @@ pub(crate) fn serve(args: &IngestArgs) -> anyhow::Result<u8> {
     Ok(exit::OK)
 }
 
-/// The process.
+/// The learner process.
 pub(crate) struct Learner {
     child: Child,
     pub(crate) url: String,
@@ -86,12 +86,12 @@ impl Learner {
         Ok(Self { url: format!("http://{address}"), child })
     }
 
-    /// Most memory so far, MiB.
+    /// Peak memory in MiB.
     pub(crate) fn peak_mib(&self) -> f64 {
         memory_mib(self.child.id().unwrap_or_default(), "VmHWM:")
     }
 
-    /// Asks it to stop; how long that took.
+    /// Sends SIGTERM; returns the time until the process ended.
     pub(crate) async fn stop(&mut self) -> anyhow::Result<Duration> {
         let pid = self.child.id().and_then(|id| Pid::from_raw(id as i32)).context("the learner has ended")?;
         let start = Instant::now();
