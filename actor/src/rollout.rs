@@ -142,7 +142,9 @@ impl Roller {
                     }
                     symmetries = features.symmetries;
                 }
-                (Driver::Controller(_), Some(controller)) => controller.act(&state.joint_state(), &mut chosen.actions)?,
+                (Driver::Controller(_), Some(controller)) => {
+                    controller.act(&state.joint_state(), &mut chosen.actions)?
+                }
                 (Driver::Controller(_), None) => {}
             }
             if keep {

@@ -2,7 +2,6 @@
 
 use crate::checkpoint;
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::page::{LivePage, RunInfo};
 use crate::run_folder::{CONFIG_FILE, RunFolderState};
 use crate::run_identity::RunIdentity;
 use crate::serve::service::{LearnerHandle, learner_service};
@@ -19,6 +18,7 @@ use magex_runtime::http::{HttpArgs, Page};
 use magex_runtime::security::ServerArgs;
 use magex_runtime::telemetry::{self, LogFormat, TraceArgs};
 use magex_runtime::{process, server, shutdown};
+use magex_viewer::page::{LivePage, RunInfo};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

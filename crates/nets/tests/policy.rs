@@ -3,8 +3,8 @@
 
 use candle_core::{Result, Tensor, Var};
 use magex_core::config::RunConfig;
-use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::joint_state::JointState;
+use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;

@@ -6,7 +6,6 @@ use crate::run_events::{CollectError, StopReason};
 use crate::serve::shared::Shared;
 use crate::serve::work::CollectedPlan;
 use magex_core::ids::{Shard, ShardKind};
-use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::weights::Weights;
 use std::sync::Arc;

@@ -4,6 +4,7 @@ use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::{RunObserver, RunStart};
 use crate::run_events::{IterationReport, RunEvent};
 use crate::serve::shared::Shared;
+use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;

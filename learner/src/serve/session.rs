@@ -13,7 +13,7 @@ use magex_proto::{PROTOCOL_VERSION, v1};
 use magex_runtime::{status, trace};
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use tokio::sync::mpsc;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;

@@ -1,7 +1,7 @@
 //! Validation of results before the learner trains on them.
 
 use bytes::Bytes;
-use magex_core::ids::{RunId, Shard};
+use magex_core::ids::RunId;
 use magex_core::metrics_table::METRICS;
 use magex_core::statics::StaticSpec;
 use magex_core::task::TaskConfig;

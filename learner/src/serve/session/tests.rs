@@ -5,6 +5,7 @@ use crate::serve::validate::Limits;
 use crate::serve::weights_board::Weights;
 use bytes::Bytes;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
+use std::time::Duration;
 use tokio_stream::wrappers::ReceiverStream;
 
 fn shared(lease: Duration) -> Arc<Shared> {
