@@ -2,7 +2,6 @@
 
 use crate::checkpoint;
 use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::page::{LivePage, RunInfo};
 use crate::run_folder::{CONFIG_FILE, RunFolderState};
 use crate::run_identity::RunIdentity;
 use crate::serve::service::{LearnerHandle, learner_service};
@@ -18,6 +17,7 @@ use magex_runtime::health::probe;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
 use magex_runtime::{process, server};
+use magex_viewer::page::{LivePage, RunInfo};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -9,16 +9,13 @@
 //! | [`collector`] | the seam between the training loop and the actors |
 //! | [`run_events`], [`run_identity`] | what a run reports, and how it is identified |
 //! | [`checkpoint`] | what a resume needs |
-//! | [`page`] | the live page |
 //! | [`cli`] | the command line of `magex-learner` |
 
-pub mod bench;
 pub mod checkpoint;
 pub mod cli;
 pub mod collector;
 #[cfg(test)]
 mod fixtures;
-pub mod page;
 pub mod report;
 pub mod run_events;
 mod run_folder;

@@ -10,7 +10,6 @@ pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
 use crate::checkpoint::{self, CheckpointError, Progress, sha256_hex};
 use crate::collector::Collector;
-use crate::page::{Phase, RunEnd};
 use crate::report::means::{EvalSummary, summarise};
 use crate::report::metrics_file::{IterationMetrics, MetricsFile, Summary, Timing};
 use crate::report::observer::{RunObserver, RunStart};
@@ -27,6 +26,7 @@ use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
+use magex_viewer::page::{Phase, RunEnd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;

@@ -1,7 +1,7 @@
 //! Assignment of agents to goals by distance.
 //!
 //! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 6), [`bottleneck()`] minimises the longest
-//! distance instead of the sum, [`greedy()`], [`random`] and [`two_swap`] are the baselines a learned commander is
+//! distance instead of the sum, [`greedy()`] and [`random`] are the baselines a learned commander is
 //! compared with, and [`duals`] are entropic transport prices, a feature for such a commander.
 //!
 //! Costs are row-major `[rows, cols]`: rows are agents, columns are goals. Either side may be the longer one; it then
@@ -14,14 +14,11 @@
 
 use thiserror::Error;
 
-pub mod bench;
 pub mod bottleneck;
 pub mod duals;
 pub mod exact;
-pub mod golden;
 pub mod greedy;
 pub mod random;
-pub mod two_swap;
 
 pub use bottleneck::{BottleneckSolver, bottleneck};
 pub use exact::{Solver, exact, exact_points};

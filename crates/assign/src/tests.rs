@@ -1,6 +1,4 @@
-use crate::bench::uniform_points;
 use crate::duals::{Schedule, sinkhorn_duals};
-use crate::two_swap::two_swap;
 use crate::*;
 use magex_core::rng::{Key, Purpose, Stream};
 use pathfinding::kuhn_munkres::kuhn_munkres_min;
@@ -9,6 +7,13 @@ use proptest::prelude::*;
 
 fn stream(index: u32) -> Stream {
     Key::new(5, Purpose::Bench, &[index]).stream()
+}
+
+/// n agents and n goals, uniform in the unit square: (agents `[n, 2]`, goals `[n, 2]`).
+fn uniform_points(n: usize, index: u32) -> (Vec<f32>, Vec<f32>) {
+    let mut stream = Key::new(0, Purpose::Bench, &[n as u32, index]).stream();
+    let mut points = || (0..2 * n).map(|_| stream.uniform32()).collect();
+    (points(), points())
 }
 
 /// Shape, entries.
@@ -206,11 +211,10 @@ proptest! {
         let answer = greedy(cost, *rows, *cols).unwrap();
         check_matching(&problem, &answer);
         prop_assert!(answer.cost >= optimum - scale);
-        let mut col_of_row = random::random(*rows, *cols, &mut stream(seed)).unwrap();
-        let before = cost_of(cost, *cols, &col_of_row);
-        let after = two_swap(cost, *rows, *cols, &mut col_of_row, 100).unwrap();
-        check_matching(&problem, &Assignment { col_of_row, cost: after });
-        prop_assert!(optimum - scale <= after && after <= before);
+        let col_of_row = random::random(*rows, *cols, &mut stream(seed)).unwrap();
+        let cost = cost_of(cost, *cols, &col_of_row);
+        check_matching(&problem, &Assignment { col_of_row, cost });
+        prop_assert!(cost >= optimum - scale);
     }
 }
 
@@ -316,8 +320,6 @@ fn bad_problems_are_refused_and_named() {
     assert!(points(&[0.0; 3], &[0.0; 2], 2).contains("agents: 3 numbers"));
     assert!(points(&[0.0; 2], &[], 2).contains("empty"));
     assert!(points(&[0.0; 2], &[0.0; 2], 0).contains("dims"));
-    let twice = two_swap(&[1.0; 4], 2, 2, &mut [0, 0], 1).unwrap_err().to_string();
-    assert!(twice.contains("col_of_row"), "{twice}");
 }
 
 #[test]
@@ -419,59 +421,4 @@ fn duals_refuse_bad_input_by_name() {
     assert!(refuse(&[1.0, 2.0], &Schedule { last: 0.0, ..good }).contains("schedule.last"));
     assert!(refuse(&[1.0, 2.0], &Schedule { rounds: 0, ..good }).contains("schedule.rounds"));
     assert!(refuse(&[1.0, 2.0], &Schedule { tolerance: f32::NAN, ..good }).contains("schedule.tolerance"));
-}
-
-const SUBSET: &str = include_str!("../testdata/dev-subset.json");
-
-#[test]
-fn the_recorded_problems_agree() {
-    let report = golden::verify_assignment(SUBSET).unwrap();
-    assert!(report.passed(), "{:?}", report.mismatches);
-    assert_eq!((report.problems, report.worst <= 1e-12), (107, true), "{}", report.worst);
-    assert!(report.matchings > 50);
-}
-
-#[test]
-fn malformed_recordings_are_refused_by_field() {
-    let case = r#"{"name":"a","rows":1,"cols":2,"row_ind":[0],"col_ind":[1],"cost":1,"unique":true,"matrix":[2,1]}"#;
-    let file = |case: &str| format!(r#"{{"format":"assignment-golden-1","meta":{{}},"cases":[{case}]}}"#);
-    assert!(golden::verify_assignment(&file(case)).unwrap().passed());
-    for (from, to, field) in [
-        ("\"rows\":1", "\"rows\":0", "cases[0].rows"),
-        ("\"cols\":2", "\"cols\":\"2\"", "cases[0].cols"),
-        ("[2,1]", "[2,null]", "cases[0].matrix[1]"),
-        ("[2,1]", "[2]", "cases[0].matrix"),
-        ("\"matrix\":[2,1]", "\"agents\":[[0,0]]", "cases[0].matrix"),
-        ("\"matrix\":[2,1]", "\"agents\":[[0,0]],\"goals\":[[0,0],[1]]", "cases[0].goals[1]"),
-        ("\"col_ind\":[1]", "\"col_ind\":[2]", "cases[0].col_ind[0]"),
-        ("\"col_ind\":[1]", "\"col_ind\":[]", "cases[0].col_ind"),
-        ("\"cost\":1", "\"cost\":null", "cases[0].cost"),
-        ("\"unique\":true", "\"unique\":1", "cases[0].unique"),
-    ] {
-        assert!(case.contains(from));
-        let error = golden::verify_assignment(&file(&case.replace(from, to))).unwrap_err();
-        assert_eq!(error.field, field, "{error}");
-    }
-    for (text, field) in [("{", "file"), ("[]", "file"), ("{}", "format"), (r#"{"format":"x"}"#, "format")] {
-        assert_eq!(golden::verify_assignment(text).unwrap_err().field, field);
-    }
-    assert_eq!(golden::verify_assignment(&file("")).unwrap_err().field, "cases");
-}
-
-#[test]
-fn a_wrong_recording_is_a_mismatch_and_not_an_error() {
-    let wrong = SUBSET.replace(r#""cost":3.5792"#, r#""cost":3.5793"#);
-    let report = golden::verify_assignment(&wrong).unwrap();
-    assert!(!report.passed());
-    assert_eq!(report.mismatches.len(), 1);
-    assert_eq!(report.mismatches[0].name, "tiny_1x1");
-    assert!(report.worst > 1e-6 && report.worst_problem == "tiny_1x1");
-}
-
-#[test]
-fn timings_are_positive_and_refuse_nothing_to_do() {
-    assert!(bench::time_exact(10, 3).unwrap() > 0.0);
-    assert!(bench::time_duals(10, 3, &Schedule::default()).unwrap() > 0.0);
-    assert!(bench::time_exact(10, 0).is_err());
-    assert!(bench::time_exact(0, 1).is_err());
 }

@@ -9,10 +9,9 @@
 
 mod constants;
 pub mod control;
+pub mod linalg;
 pub mod model;
-
-pub(crate) mod linalg;
-pub(crate) mod world;
+pub mod world;
 
 mod engine;
 mod episode;

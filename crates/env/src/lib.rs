@@ -1,22 +1,19 @@
 //! The tasks: Simple Spread and Push Ball on a particle engine, drones on a rigid-body engine (paper, section 5.1). Physics,
-//! starts, reward, metrics, the scripted controllers used as yardsticks, and the check of all of it against recordings of the
-//! authors' simulators.
+//! starts, reward, metrics, and the scripted controllers used as yardsticks.
 //!
 //! An [`Env`] is a batch of B independent episodes stepped together, particle worlds one per SIMD lane. An episode is a pure
 //! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and
 //! on any machine.
 //!
-//! No networks, no threads, no clock (except in [`mod@bench`], which measures).
+//! No networks, no threads, no clock. `magex-verify` checks all of it against recordings of the authors' simulators.
 
 #![allow(
     clippy::needless_range_loop,
     reason = "kernels index several arrays by one counter; iterators hide which elements meet"
 )]
 
-pub mod bench;
 pub mod controller;
 pub mod drones;
-pub mod golden;
 pub mod particles;
 pub mod push_ball;
 pub mod shell;

@@ -4,7 +4,7 @@ pub(crate) mod arrival;
 pub(crate) mod cells;
 pub mod constants;
 pub mod curves;
-pub(crate) mod physics;
+pub mod physics;
 pub(crate) mod placement;
 pub mod real;
 pub(crate) mod swarm;

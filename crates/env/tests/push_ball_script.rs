@@ -9,7 +9,7 @@ mod assign;
 
 use assign::exact;
 use magex_core::joint_state::JointState;
-use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, SPAWN_SUCCESS_RATE, SUCCESS_RATE};
+use magex_core::metrics_table::{MATCHED_SUCCESS_RATE, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
@@ -17,7 +17,7 @@ use magex_core::trajectory::EpisodeMetrics;
 use magex_env::controller::PushBallScript;
 use magex_env::{Controller as _, Env as _, PushBall};
 
-fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) {
+fn play(task: &TaskConfig, episodes: u32) -> Vec<EpisodeMetrics> {
     let n = task.agents;
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
     let mut env = PushBall::new(task, streams, false).unwrap();
@@ -34,8 +34,7 @@ fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) 
     env.set_goals(&goals).unwrap();
     let mut actions = vec![0; n * episodes as usize];
     let mut rewards = vec![0.0; actions.len()];
-    let mut solved = None;
-    for step in 1..=task.horizon {
+    for _ in 0..task.horizon {
         env.write_positions(&mut positions).unwrap();
         env.write_velocities(&mut velocities).unwrap();
         let state = JointState {
@@ -47,46 +46,17 @@ fn play(task: &TaskConfig, episodes: u32) -> (Vec<EpisodeMetrics>, Option<u32>) 
         };
         script.act(&state, &mut actions).unwrap();
         env.step(&actions, &mut rewards).unwrap();
-        if solved.is_none() && mean(&env.scores(), |score| score[SUCCESS_RATE]) >= 0.97 {
-            solved = Some(step);
-        }
     }
-    (env.scores(), solved)
+    env.scores()
 }
 
 fn mean(scores: &[EpisodeMetrics], value: fn(&EpisodeMetrics) -> f32) -> f32 {
     scores.iter().map(value).sum::<f32>() / scores.len() as f32
 }
 
-/// Every setting of the paper; prints what the script reaches.
-#[test]
-#[ignore = "a measurement of minutes"]
-fn measure() {
-    use Spawn::{Authors, Lines, Uniform};
-    let mut settings = vec![(5, Uniform), (20, Uniform)];
-    settings.extend((0..4).map(|layout| (20, Lines(Some(layout)))));
-    settings.extend((0..4).map(|layout| (20, Authors(Some(layout)))));
-    settings.push((50, Uniform));
-    for (agents, spawn) in settings {
-        let task = TaskConfig::of(TaskName::PushBall, agents, spawn);
-        let (scores, solved) = play(&task, 100);
-        let full = scores.iter().filter(|score| score[SUCCESS_RATE] == 1.0).count();
-        let [success, own, start, hits] = [
-            |score: &EpisodeMetrics| score[SUCCESS_RATE],
-            |score: &EpisodeMetrics| score[MATCHED_SUCCESS_RATE],
-            |score: &EpisodeMetrics| score[SPAWN_SUCCESS_RATE],
-            |score: &EpisodeMetrics| score[COLLISIONS_PER_AGENT_STEP],
-        ]
-        .map(|value| mean(&scores, value));
-        eprintln!(
-            "{agents:3} {spawn:10} success {success:.4} own {own:.4} full {full} spawn {start:.3} hits {hits:.4} 97 % at {solved:?}"
-        );
-    }
-}
-
 fn check(agents: usize, spawn: Spawn, episodes: u32, at_least: f32) {
     let task = TaskConfig::of(TaskName::PushBall, agents, spawn);
-    let (scores, _) = play(&task, episodes);
+    let scores = play(&task, episodes);
     let success = mean(&scores, |score| score[SUCCESS_RATE]);
     assert!(success >= at_least, "{agents} {spawn}: success {success}");
     // What counts is nearly always the ball that was meant.

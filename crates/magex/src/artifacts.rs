@@ -1,13 +1,14 @@
-//! The pictures of a run folder.
+//! The pictures of a run folder: `curve.svg` and `replay.html`.
 
-use crate::curve::{curve_svg, parse_metrics};
-use crate::replay::{ReplayEpisode, ReplayInfo, replay_html};
+use crate::failure::cannot_create;
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
-use std::path::{Path, PathBuf};
+use magex_viewer::curve::{curve_svg, parse_metrics};
+use magex_viewer::replay::{ReplayEpisode, ReplayInfo, replay_html};
+use std::path::Path;
 
-/// One line that says what a run is.
+/// Task, executor, scheduler and seed of a run on one line.
 pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
     format!(
@@ -21,10 +22,10 @@ pub(crate) fn describe(config: &RunConfig) -> String {
 }
 
 /// Draws `curve.svg` from `metrics.jsonl`.
-pub(crate) fn write_curve(folder: &Path, config: &RunConfig) -> anyhow::Result<PathBuf> {
+pub(crate) fn write_curve(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
     let metrics = folder.join("metrics.jsonl");
     let text = std::fs::read_to_string(&metrics).with_context(|| metrics.display().to_string())?;
-    let svg = curve_svg(&title(folder), &describe(config), &parse_metrics(&text)?)?;
+    let svg = curve_svg(&run_name(folder), &describe(config), &parse_metrics(&text)?)?;
     write(&folder.join("curve.svg"), svg.as_bytes())
 }
 
@@ -35,7 +36,7 @@ pub(crate) fn write_replay(
     subtitle: &str,
     config: &RunConfig,
     episodes: &[(Recording, Option<EpisodeMetrics>)],
-) -> anyhow::Result<PathBuf> {
+) -> anyhow::Result<()> {
     let info = ReplayInfo::of(&config.task, title, subtitle);
     let named: Vec<ReplayEpisode<'_>> = episodes
         .iter()
@@ -49,27 +50,26 @@ pub(crate) fn write_replay(
     write(path, replay_html(&info, &named)?.as_bytes())
 }
 
-/// Makes `replay.html` from the recordings that the run left.
-pub(crate) fn write_recorded_replay(folder: &Path, config: &RunConfig) -> anyhow::Result<PathBuf> {
+/// Writes `replay.html` from the recordings in the run folder.
+pub(crate) fn write_recorded_replay(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
     let source = folder.join("recordings.json");
     let bytes = std::fs::read(&source).with_context(|| source.display().to_string())?;
     let recordings: Vec<Recording> = serde_json::from_slice(&bytes).with_context(|| source.display().to_string())?;
     let episodes: Vec<_> = recordings.into_iter().map(|recording| (recording, None)).collect();
     let subtitle = format!("{} · greedy evaluation at the end of training", describe(config));
-    write_replay(&folder.join("replay.html"), &title(folder), &subtitle, config, &episodes)
+    write_replay(&folder.join("replay.html"), &run_name(folder), &subtitle, config, &episodes)
 }
 
-/// Name of the run.
-fn title(folder: &Path) -> String {
+/// Name of the run: that of its folder.
+pub(crate) fn run_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
 }
 
-/// Whole files only: written beside and renamed.
-fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<PathBuf> {
+/// Writes a file atomically: to a temporary file that is then renamed.
+pub(crate) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let mut temporary = path.as_os_str().to_owned();
     temporary.push(".tmp");
     std::fs::write(&temporary, bytes)
         .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|error| crate::failure::cannot_create(format!("{}: {error}", path.display())))?;
-    Ok(path.to_owned())
+        .map_err(|error| cannot_create(format!("{}: {error}", path.display())))
 }

@@ -2,7 +2,7 @@
 
 use crate::failure::usage;
 use crate::folder::Trained;
-use crate::local::{Crew, commander};
+use crate::local::{LoadedPolicy, commander};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
@@ -12,18 +12,18 @@ use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
 
 /// Evaluation set of `magex eval` unless another is named.
 pub(crate) const EVAL_SET: u32 = 100;
-/// Agents that one shard has at most, unless one episode has more: bounds the memory of a rollout.
+/// Limit of agents per shard, unless a single episode has more: bounds the memory of a rollout.
 const AGENTS_PER_SHARD: usize = 800;
-/// Episodes that one shard has at most.
+/// Limit of episodes per shard.
 const EPISODES_PER_SHARD: u32 = 16;
 
-/// Who drives the agents.
+/// What chooses the actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub(crate) enum Controller {
     /// The trained executor.
     #[default]
     Learned,
-    /// The scripted controller: thrust towards the goal, no learning; a yardstick.
+    /// The scripted controller: steers towards the goal without learning; a baseline.
     Scripted,
 }
 
@@ -59,19 +59,19 @@ pub(crate) fn mode_name(mode: Mode) -> &'static str {
 
 /// What an evaluation changes about the run.
 #[derive(Debug, Clone, Default, PartialEq, clap::Args)]
-#[command(next_help_heading = "What is evaluated (the run's own unless given)")]
+#[command(next_help_heading = "What is evaluated [default: as in the run]")]
 pub(crate) struct Variation {
     /// Starts: uniform, lines, lines-0..3, authors or authors-0..3.
     #[arg(long, value_name = "MODE")]
     pub(crate) spawn: Option<Spawn>,
-    /// Team size, on the map that the paper or the density of N = 50 gives it (not for the mlp executor and the ranking scheduler, which are built for one size).
+    /// Team size; the map scales with it. Not for the mlp executor and the ranking scheduler, which have a fixed size.
     #[arg(long, value_name = "N")]
     pub(crate) agents: Option<usize>,
-    /// Who hands out goals: pairwise, ranking, exact or random.
+    /// Goal scheduler: pairwise, ranking, exact or random.
     #[arg(long, value_name = "KIND")]
     pub(crate) scheduler: Option<CommanderPolicy>,
-    /// Who drives the agents.
-    #[arg(long, value_enum, value_name = "WHO", default_value_t)]
+    /// What chooses the actions.
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub(crate) controller: Controller,
     /// Joint steps per episode.
     #[arg(long, value_name = "T")]
@@ -105,21 +105,22 @@ impl Variation {
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
-        // Nothing is learned here; the chunk need not fit the horizon.
+        // Evaluation does not train: the chunk length need not divide the horizon.
         config.mappo.chunk_length = 1;
         Ok(config.validated()?)
     }
 
-    /// Who rolls out.
-    pub(crate) fn crew(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<Crew> {
+    /// The policy to evaluate.
+    pub(crate) fn policy(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<LoadedPolicy> {
         let roller = match self.controller {
             Controller::Learned => Roller::new(config, weights)?,
             Controller::Scripted => Roller::scripted(config)?,
         };
-        Ok(Crew { roller, commander: commander(config, weights, self.scheduler)?, random_assignment_fraction: 0.0 })
+        let commander = commander(config, weights, self.scheduler)?;
+        Ok(LoadedPolicy { roller, commander, random_assignment_fraction: 0.0 })
     }
 
-    /// The scheduler that hands out goals.
+    /// The scheduler that assigns the goals.
     pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderPolicy {
         self.scheduler.unwrap_or(config.commander.kind)
     }
@@ -134,11 +135,11 @@ pub(crate) struct Episodes {
     pub(crate) set: u32,
     /// How actions and goals are chosen.
     pub(crate) mode: Mode,
-    /// Record the first so many.
+    /// Number of episodes to record, from the first.
     pub(crate) record: u32,
 }
 
-/// The evaluation sets of training are not for reporting.
+/// Parses an evaluation set; the sets that training uses are rejected.
 pub(crate) fn eval_set(text: &str) -> Result<u32, String> {
     let first = EVAL_SET_TRAINING.max(EVAL_SET_FINAL) + 1;
     match text.parse() {
@@ -149,14 +150,14 @@ pub(crate) fn eval_set(text: &str) -> Result<u32, String> {
 
 /// Rolls the episodes out: their metrics in order, and the recordings of the first ones.
 pub(crate) fn roll_out(
-    crew: &Crew,
+    policy: &LoadedPolicy,
     config: &RunConfig,
     episodes: Episodes,
     threads: usize,
 ) -> anyhow::Result<(Vec<EpisodeMetrics>, Vec<Recording>)> {
     let plan = plan(episodes, config.task.agents);
     let (mut metrics, mut recordings) = (Vec::new(), Vec::new());
-    for result in crew.work_all(&plan, threads)? {
+    for result in policy.rollout_all(&plan, threads)? {
         if let ShardResult::Eval(EvalOutcome { metrics: more, recording, .. }) = result {
             metrics.extend(more);
             recordings.extend(recording);
@@ -165,7 +166,8 @@ pub(crate) fn roll_out(
     Ok((metrics, recordings))
 }
 
-/// Recorded episodes are shards of their own: a shard records its first episode. The cut does not change a result.
+/// A shard records only its first episode, so every recorded episode gets its own shard. The partition does not change
+/// results.
 fn plan(episodes: Episodes, agents: usize) -> Vec<Shard> {
     let most = (AGENTS_PER_SHARD / agents.max(1)).clamp(1, EPISODES_PER_SHARD as usize) as u32;
     let mut shards = Vec::new();
@@ -209,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn training_sets_are_refused() {
+    fn training_sets_are_rejected() {
         for set in ["0", "1", "2", "x"] {
             assert!(eval_set(set).unwrap_err().contains("3 or more"));
         }
@@ -223,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn another_size_is_the_same_density_and_fixed_sizes_are_refused() {
+    fn another_size_keeps_the_density_and_fixed_sizes_are_rejected() {
         let vary = Variation { agents: Some(200), horizon: Some(77), ..Variation::default() };
         let config = vary.apply(&trained("")).unwrap();
         assert_eq!((config.task.agents, config.task.side, config.task.horizon), (200, 20.0, 77));

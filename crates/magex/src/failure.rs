@@ -1,28 +1,48 @@
-//! Errors that know the exit code they end the process with.
+//! Errors that carry the exit code of the process.
 
+use crate::options::CommonOptions;
+use crate::output::note;
 use magex_core::config::ConfigError;
 use magex_learner::trainer::TrainError;
 use magex_runtime::exit::{self, Failure};
 use std::fmt;
+use std::process::ExitCode;
 
 /// Wrong usage or configuration: nothing was started.
-pub(crate) fn usage(message: impl fmt::Display) -> anyhow::Error {
+pub fn usage(message: impl fmt::Display) -> anyhow::Error {
     coded(exit::USAGE, message)
 }
 
 /// An output cannot be created.
-pub(crate) fn cannot_create(message: impl fmt::Display) -> anyhow::Error {
+pub fn cannot_create(message: impl fmt::Display) -> anyhow::Error {
     coded(exit::CANNOT_CREATE, message)
 }
 
-/// A service that is needed cannot be used.
-pub(crate) fn unavailable(message: impl fmt::Display) -> anyhow::Error {
+/// A required service cannot be reached.
+pub fn unavailable(message: impl fmt::Display) -> anyhow::Error {
     coded(exit::UNAVAILABLE, message)
 }
 
 /// Ends the process with `code`.
-pub(crate) fn coded(code: u8, message: impl fmt::Display) -> anyhow::Error {
+pub fn coded(code: u8, message: impl fmt::Display) -> anyhow::Error {
     anyhow::Error::new(Failure::new(code, message))
+}
+
+/// Prints an error of the command line parser; help and version count as success.
+pub fn usage_of(error: &clap::Error) -> ExitCode {
+    // If printing fails there is no other place to report it.
+    let _ = error.print();
+    ExitCode::from(if error.use_stderr() { exit::USAGE } else { exit::OK })
+}
+
+/// The exit code of a command; reports its error.
+pub fn exit_code(result: anyhow::Result<u8>, options: &CommonOptions) -> ExitCode {
+    ExitCode::from(result.unwrap_or_else(|error| {
+        let code = code_of(&error);
+        note(format!("error: {error:#}"));
+        options.output().result(&serde_json::json!({ "error": format!("{error:#}"), "exit_code": code }));
+        code
+    }))
 }
 
 /// The exit code of an error.

@@ -1,13 +1,13 @@
-//! Run folders: where they are, what is in them, and when one may be written to.
+//! Run folders: names, content, creation and loading.
 //!
 //! | file | what it is |
 //! |---|---|
 //! | `config.toml` | the effective configuration, every key |
 //! | `metrics.jsonl` | one line per iteration |
 //! | `checkpoints/` | the latest checkpoints, weights as safetensors |
-//! | `weights.safetensors`, `summary.json`, `recordings.json` | the end of the run |
+//! | `weights.safetensors`, `summary.json`, `recordings.json` | the result of a finished run |
 //! | `curve.svg`, `replay.html` | pictures |
-//! | `logs/` | what the services of the run wrote |
+//! | `logs/` | standard error of the services |
 
 use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
@@ -19,23 +19,28 @@ use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
 /// The effective configuration.
-pub(crate) const CONFIG: &str = "config.toml";
+pub const CONFIG: &str = "config.toml";
 /// The result of a finished run.
 pub(crate) const SUMMARY: &str = "summary.json";
 /// The trained networks.
-pub(crate) const WEIGHTS: &str = "weights.safetensors";
+pub const WEIGHTS: &str = "weights.safetensors";
 
-/// `runs/<task>-<N>-<executor>-s<seed>`, or the same with -2, -3, … if there is such a folder.
+/// `runs/<task>-<N>-<executor>-s<seed>`, or the same with -2, -3, … if it exists.
 pub(crate) fn default_out(config: &RunConfig, exists: impl Fn(&Path) -> bool) -> PathBuf {
-    let name = format!("{}-{}-{}-s{}", config.task.name, config.task.agents, config.executor.kind, config.run.seed);
-    let first = Path::new("runs").join(&name);
+    let (task, executor) = (&config.task, config.executor.kind);
+    unused(&format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed), exists)
+}
+
+/// `runs/<name>`, or the same with -2, -3, … if it exists.
+pub(crate) fn unused(name: &str, exists: impl Fn(&Path) -> bool) -> PathBuf {
+    let first = Path::new("runs").join(name);
     if !exists(&first) {
         return first;
     }
     (2u32..).map(|k| Path::new("runs").join(format!("{name}-{k}"))).find(|path| !exists(path)).unwrap_or(first)
 }
 
-/// Makes the folder of a new run with its configuration. A folder with something in it is refused.
+/// Creates the folder of a new run with its configuration. A folder that is not empty is rejected.
 pub(crate) fn create(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
     let failed = |error: std::io::Error| cannot_create(format!("--out {}: {error}", folder.display()));
     if folder.exists() {
@@ -54,7 +59,7 @@ pub(crate) fn create(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
 }
 
 /// The configuration of an existing run.
-pub(crate) fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
+pub fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
     let path = folder.join(CONFIG);
     let text = std::fs::read_to_string(&path).map_err(|error| match error.kind() {
         std::io::ErrorKind::NotFound => {
@@ -66,25 +71,25 @@ pub(crate) fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
     RunConfig::from_toml(&text).with_context(|| path.display().to_string())
 }
 
-/// A trained run, or its beginnings.
+/// A run with its latest weights.
 #[derive(Debug)]
-pub(crate) struct Trained {
-    /// What it was trained with.
-    pub(crate) config: RunConfig,
+pub struct Trained {
+    /// The configuration of the run.
+    pub config: RunConfig,
     /// Weights file.
-    pub(crate) weights: Vec<u8>,
+    pub weights: Vec<u8>,
     /// SHA-256 of the weights file.
-    pub(crate) sha256: String,
-    /// Name for people.
-    pub(crate) name: String,
-    /// The folder, unless a weights file was named.
-    pub(crate) folder: Option<PathBuf>,
-    /// What a person should know about the weights.
-    pub(crate) notes: Vec<String>,
+    pub sha256: String,
+    /// Display name.
+    pub name: String,
+    /// The run folder; `None` for a weights file.
+    pub folder: Option<PathBuf>,
+    /// Warnings about the weights.
+    pub notes: Vec<String>,
 }
 
 /// Loads a run folder, or a weights file together with a configuration file.
-pub(crate) fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
+pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
     if path.is_file() {
         let Some(config) = config else {
             return Err(usage(format!("{} is a file: add --config with the run's config.toml", path.display())));
@@ -106,7 +111,7 @@ pub(crate) fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained
     Ok(Trained { config, sha256: sha256_hex(&weights), weights, name, folder: Some(path.to_owned()), notes })
 }
 
-/// The final weights if they are there and whole, else those of the newest usable checkpoint.
+/// The final weights if they exist and are intact, otherwise those of the newest usable checkpoint.
 fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec<String>)> {
     let mut notes = Vec::new();
     let expected = std::fs::read(folder.join(SUMMARY))
@@ -139,7 +144,7 @@ pub(crate) fn what_is_wrong(error: &CheckpointError) -> String {
     format!("checkpoint {checkpoint} is corrupt ({}: {reason})", text(path.file_name()))
 }
 
-/// The checkpoint that a resumed run continues from when the newest `skipped` ones cannot be used.
+/// The checkpoint that a resumed run continues from when the newest `skipped` ones are unusable.
 pub(crate) fn continues_from(folder: &Path, skipped: usize) -> Option<String> {
     let folders = checkpoint::list(folder).ok()?;
     folders.iter().rev().nth(skipped)?.file_name().map(|name| name.to_string_lossy().into_owned())
@@ -150,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_default_name_says_what_the_run_is_and_never_collides() {
+    fn the_default_name_describes_the_run_and_is_unused() {
         let config = RunConfig::default();
         assert_eq!(default_out(&config, |_| false), Path::new("runs/simple-spread-50-magex-s1"));
         let taken = ["runs/simple-spread-50-magex-s1", "runs/simple-spread-50-magex-s1-2"];
@@ -159,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_something_in_it_is_refused_with_a_remedy() {
+    fn a_folder_that_is_not_empty_is_rejected_with_a_remedy() {
         let dir = std::env::temp_dir().join(format!("magex-folder-{}", std::process::id()));
         let _ = std::fs::remove_dir_all(&dir);
         let config = RunConfig::default();

@@ -1,20 +1,27 @@
-//! The `magex` command as a library: everything in one process ([`local`]), the checks and pictures it makes
-//! ([`verify`], [`replay`], [`curve`]), and the command line itself ([`cli`]).
+//! The `magex` command as a library.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`cli`], `commands` | the command line: one file per command |
+//! | [`options`], [`settings`], [`output`], [`failure`] | what every command shares: options, configuration, printing, exit codes |
+//! | [`local`], `evaluate` | rollouts in this process, for training and for evaluation |
+//! | [`supervise`] | training with learner, commander and actors as child processes |
+//! | [`folder`], `artifacts` | run folders, and the pictures in them |
 
 pub mod cli;
-pub mod curve;
+pub mod failure;
+pub mod folder;
 pub mod local;
-pub mod replay;
-pub mod verify;
+pub mod options;
+pub mod output;
+pub mod settings;
+pub mod supervise;
 
 mod artifacts;
 mod commands;
 mod evaluate;
-mod failure;
-mod folder;
 mod logging;
-mod output;
+mod parallel;
+mod parent_watch;
 mod progress;
-mod settings;
-mod supervise;
 mod synthetic;

@@ -1,4 +1,4 @@
-//! Log lines on standard error that leave the live status line of a terminal alone.
+//! Log lines on standard error, above the live status line of a terminal.
 
 use indicatif::ProgressBar;
 use magex_runtime::telemetry::LogFormat;
@@ -7,15 +7,15 @@ use std::sync::{Mutex, PoisonError};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::MakeWriter;
 
-/// The status line that is on the screen now.
+/// The status line on the screen.
 static LIVE: Mutex<Option<ProgressBar>> = Mutex::new(None);
 
-/// Puts a status line on the screen, or takes it away.
+/// Sets or removes the status line.
 pub(crate) fn set_live_line(bar: Option<ProgressBar>) {
     *LIVE.lock().unwrap_or_else(PoisonError::into_inner) = bar;
 }
 
-/// Writes something to standard error with the status line out of the way.
+/// Hides the status line while `write` prints to standard error.
 pub(crate) fn around_live_line(write: impl FnOnce()) {
     let live = LIVE.lock().unwrap_or_else(PoisonError::into_inner).clone();
     match live {
@@ -33,7 +33,7 @@ pub(crate) fn init(format: LogFormat, verbose: u8) {
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(Lines);
-    // A second call changes nothing.
+    // A second call has no effect.
     let _ = match format {
         LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).with_target(false).try_init(),
         LogFormat::Json => builder.json().flatten_event(true).try_init(),

@@ -1,34 +1,34 @@
-//! What a command says on standard output: text and tables for people, or one JSON object on the last line.
+//! Results on standard output: text and tables, or one JSON object on the last line.
 
 use serde_json::Value;
 use std::io::{IsTerminal as _, Write as _};
 
-pub(crate) use magex_core::metrics_table::share;
+pub use magex_core::metrics_table::share;
 
-/// Where results go. With `--json` standard output carries the JSON object alone, and what people read goes to standard error.
+/// Where results go. With `--json` standard output carries only the JSON object, and text goes to standard error.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Output {
+pub struct Output {
     json: bool,
 }
 
 impl Output {
-    /// For people, or for machines.
-    pub(crate) fn new(json: bool) -> Self {
+    /// Text, or JSON.
+    pub fn new(json: bool) -> Self {
         Self { json }
     }
 
-    /// Text for people.
-    pub(crate) fn say(&self, text: impl AsRef<str>) {
+    /// Prints text.
+    pub fn say(&self, text: impl AsRef<str>) {
         let text = text.as_ref();
-        // Whoever closed the pipe does not want to know.
+        // A closed pipe is no error.
         let _ = match self.json {
             true => writeln!(std::io::stderr().lock(), "{text}"),
             false => writeln!(std::io::stdout().lock(), "{text}"),
         };
     }
 
-    /// The machine-readable result.
-    pub(crate) fn result(&self, value: &Value) {
+    /// Prints the machine-readable result.
+    pub fn result(&self, value: &Value) {
         if self.json {
             let mut stdout = std::io::stdout().lock();
             let _ = writeln!(stdout, "{value}").and_then(|()| stdout.flush());
@@ -36,8 +36,8 @@ impl Output {
     }
 }
 
-/// A line on standard error.
-pub(crate) fn note(text: impl AsRef<str>) {
+/// Prints a line to standard error.
+pub fn note(text: impl AsRef<str>) {
     crate::logging::around_live_line(|| {
         let _ = writeln!(std::io::stderr().lock(), "{}", text.as_ref());
     });
@@ -50,19 +50,19 @@ pub(crate) fn colours() -> bool {
 
 /// A table with a heading; the first `left` columns are aligned left, numbers to the right.
 #[derive(Debug, Clone)]
-pub(crate) struct Table {
+pub struct Table {
     left: usize,
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
     /// With the names of the columns.
-    pub(crate) fn new(left: usize, heading: &[&str]) -> Self {
+    pub fn new(left: usize, heading: &[&str]) -> Self {
         Self { left, rows: vec![heading.iter().map(|&cell| cell.to_owned()).collect()] }
     }
 
     /// Adds a row.
-    pub(crate) fn row(&mut self, cells: Vec<String>) {
+    pub fn row(&mut self, cells: Vec<String>) {
         self.rows.push(cells);
     }
 }
@@ -90,7 +90,7 @@ impl std::fmt::Display for Table {
 }
 
 /// 12345.6 → `12,346`.
-pub(crate) fn thousands(value: f64) -> String {
+pub fn thousands(value: f64) -> String {
     let digits = format!("{:.0}", value.abs());
     let mut out = String::new();
     for (index, digit) in digits.chars().enumerate() {
@@ -103,7 +103,7 @@ pub(crate) fn thousands(value: f64) -> String {
 }
 
 /// A span of time.
-pub(crate) fn seconds(value: f64) -> String {
+pub fn seconds(value: f64) -> String {
     if value < 100.0 {
         format!("{value:.1} s")
     } else {
@@ -111,7 +111,7 @@ pub(crate) fn seconds(value: f64) -> String {
     }
 }
 
-/// How this command is called, for the lines that say what to run next.
+/// How this program was called, for hints about the next command.
 pub(crate) fn program() -> String {
     if std::env::var_os("CARGO_MANIFEST_DIR").is_some() {
         return if cfg!(debug_assertions) { "cargo run --".into() } else { "cargo run --release --".into() };
@@ -132,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_read_well() {
+    fn numbers_are_formatted() {
         assert_eq!(
             ["0", "999", "1,000", "1,234,568"],
             [0.4, 999.0, 1000.0, 1_234_567.8].map(thousands).each_ref().map(|s| s.as_str())

@@ -1,4 +1,4 @@
-//! How a run shows itself while it goes: a table with a live status line on a terminal, log lines elsewhere.
+//! Progress of a run: a table (80 columns for Simple Spread) with a live status line on a terminal, log lines elsewhere.
 
 use crate::logging::set_live_line;
 use crate::output::{colours, note, thousands};
@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 /// Rows between two headings of the table.
 const PAGE: u32 = 40;
 
-/// One line of metrics.jsonl, as far as it is shown.
+/// The part of a line of metrics.jsonl that is shown.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 struct Row {
     iteration: u32,
@@ -61,7 +61,7 @@ impl Shares {
     }
 }
 
-/// Shows a run.
+/// Shows the progress of a run.
 pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     rows: u32,
@@ -100,7 +100,7 @@ impl Progress {
         note(format!("{bold}{}{plain}", crate::artifacts::describe(config)));
         note(format!("{title} · {out}\n"));
         let bar = ProgressBar::with_draw_target(Some(config.run.max_steps), ProgressDrawTarget::stderr_with_hz(10));
-        let template = "{spinner:.cyan} {bar:20.cyan/dim} {human_pos} of {human_len} joint steps · {msg} · {elapsed}";
+        let template = "{spinner:.cyan} {bar:12.cyan/dim} {human_pos}/{human_len} steps · {msg} · {elapsed}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style.progress_chars("━━─"));
         }
@@ -110,7 +110,7 @@ impl Progress {
         Self { bar: Some(bar), rows: 0, target, metrics, colours, last_iteration: None, page: None }
     }
 
-    /// Something happened.
+    /// Shows an event of the run.
     pub(crate) fn event(&mut self, event: &RunEvent) {
         match event {
             RunEvent::Iteration(report) => match serde_json::from_str::<Row>(&report.metrics_json) {
@@ -118,7 +118,7 @@ impl Progress {
                     self.last_iteration = Some(Instant::now());
                     self.row(&row);
                 }
-                Err(error) => tracing::warn!(%error, "metrics of an iteration cannot be read"),
+                Err(error) => tracing::warn!(%error, "the metrics of an iteration are malformed"),
             },
             RunEvent::Log(text) => tracing::info!("{text}"),
             RunEvent::Checkpoint { iteration, path } => tracing::debug!(%iteration, path, "checkpoint"),
@@ -126,12 +126,12 @@ impl Progress {
         }
     }
 
-    /// When the last iteration was reported: the one that reached the target, if it was reached.
+    /// Time at which the last iteration was reported.
     pub(crate) fn last_iteration(&self) -> Option<Instant> {
         self.last_iteration
     }
 
-    /// Says where the live page is.
+    /// Shows the address of the live page.
     pub(crate) fn page(&mut self, address: &str) {
         let url = format!("http://{address}/");
         match &self.bar {
@@ -141,19 +141,19 @@ impl Progress {
         self.page = Some(url);
     }
 
-    /// Where the live page is, or was.
+    /// Address of the live page, if there was one.
     pub(crate) fn page_url(&self) -> Option<&str> {
         self.page.as_deref()
     }
 
-    /// Text of the status line.
+    /// Sets the text of the status line.
     pub(crate) fn status(&self, text: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(text.to_owned());
         }
     }
 
-    /// Takes the status line away.
+    /// Removes the status line.
     pub(crate) fn end(&mut self) {
         set_live_line(None);
         if let Some(bar) = self.bar.take() {
@@ -210,18 +210,19 @@ impl Drop for Progress {
 
 /// Width of a metric's column.
 fn width(metric: usize) -> usize {
-    METRICS[metric].label.len().max(8)
+    METRICS[metric].label.len().max(6)
 }
 
+/// The last column: percent of the time for rollouts, executor update and commander update.
 fn heading(metrics: &[usize]) -> String {
-    let mut text = format!("{:>5} {:>10}", "iter", "steps");
+    let mut text = format!("{:>4} {:>10}", "iter", "steps");
     for &metric in metrics {
         text += &format!(" {:>1$}", METRICS[metric].label, width(metric));
         if metric == SUCCESS_RATE {
-            text += &format!(" {:>8}", "sampled");
+            text += &format!(" {:>7}", "sampled");
         }
     }
-    text + &format!(" {:>8}  time: collect update commander", "steps/s")
+    text + &format!(" {:>7} roll/exe/com %", "steps/s")
 }
 
 fn line(row: &Row, percent: [f64; 4], metrics: &[usize], highlight: bool) -> String {
@@ -229,7 +230,7 @@ fn line(row: &Row, percent: [f64; 4], metrics: &[usize], highlight: bool) -> Str
         let text = value.map_or_else(|| "-".to_owned(), |value| METRICS[metric].write(value));
         format!("{text:>0$}", width(metric))
     };
-    let mut text = format!("{:>5} {:>10}", row.iteration, thousands(row.joint_env_steps as f64));
+    let mut text = format!("{:>4} {:>10}", row.iteration, thousands(row.joint_env_steps as f64));
     for &metric in metrics {
         let value = cell(metric, row.metric(metric));
         let highlight = highlight && metric == SUCCESS_RATE;
@@ -238,11 +239,11 @@ fn line(row: &Row, percent: [f64; 4], metrics: &[usize], highlight: bool) -> Str
             text += &format!(" {}", cell(metric, row.sampled(metric)));
         }
     }
-    if row.sampled(SUCCESS_RATE).is_none() {
-        return text + &format!(" {:>8}        evaluation only", "-");
-    }
-    let speed = thousands(row.joint_steps_per_s);
-    text + &format!(" {speed:>8}  {:>11.0} % {:>4.0} % {:>7.0} %", percent[0], percent[1], percent[2])
+    let (speed, times) = match row.sampled(SUCCESS_RATE) {
+        Some(_) => (thousands(row.joint_steps_per_s), format!("{:.0}/{:.0}/{:.0}", percent[0], percent[1], percent[2])),
+        None => ("-".to_owned(), "evaluation".to_owned()),
+    };
+    text + &format!(" {speed:>7} {times}")
 }
 
 /// To four decimals, for log lines.
@@ -264,17 +265,16 @@ mod tests {
             "joint_steps_per_s":1234.5,"wall_s":9.0}"#;
         let row: Row = serde_json::from_str(json).unwrap();
         let text = line(&row, row.timing.percent(), &SHOWN, false);
-        assert_eq!(
-            text,
-            "   12     11,520   0.9999   0.9700     61.2     0.0123   1.0004    1,234           30 %   60 %      10 %"
-        );
+        assert_eq!(text, "  12     11,520  0.9999  0.9700    61.2     0.0123 1.0004   1,234 30/60/10");
         let heading = heading(&SHOWN);
-        assert_eq!(heading.find("success").unwrap() + 7, text.find("0.9999").unwrap() + 6);
-        assert_eq!(heading.len(), "    iter".len() - 3 + text.len() - 5);
+        for (word, value) in [("success", "0.9999"), ("cost", "1.0004"), ("steps/s", "1,234")] {
+            assert_eq!(heading.find(word).unwrap() + word.len(), text.find(value).unwrap() + value.len(), "{word}");
+        }
+        assert!(heading.len() <= 80 && text.len() <= 80);
     }
 
     #[test]
-    fn what_was_not_measured_is_a_dash() {
+    fn missing_values_are_shown_as_a_dash() {
         let json = r#"{"iteration":3,"joint_env_steps":10,"success_rate":null,"sampled_success_rate":null,
             "arrival_step":null,"collisions_per_agent_step":null,"cost_ratio":null,
             "timing":{"collect_s":0,"executor_s":0,"commander_s":0,"checkpoint_s":0},"joint_steps_per_s":0,"wall_s":1}"#;

@@ -9,7 +9,7 @@ use std::path::Path;
 
 /// Options that change single keys of the configuration.
 #[derive(Debug, Clone, Default, PartialEq, clap::Args)]
-#[command(next_help_heading = "Configuration (each wins over the file)")]
+#[command(next_help_heading = "Configuration (overrides the file)")]
 pub(crate) struct Overrides {
     /// Seed of every random stream [run.seed].
     #[arg(long, value_name = "S")]
@@ -17,7 +17,8 @@ pub(crate) struct Overrides {
     /// Budget in joint environment steps [run.max_steps].
     #[arg(long, value_name = "M")]
     pub(crate) max_steps: Option<u64>,
-    /// Stop when two evaluations in a row reach this greedy success rate; above 1 never stops early [run.target_success].
+    /// Stop when two evaluations in a row reach this greedy success rate; a value above 1 never stops early
+    /// [run.target_success].
     #[arg(long, value_name = "X")]
     pub(crate) target_success: Option<f32>,
     /// Architecture: magex, magex-literal, attention, mlp or local [executor.kind].
@@ -40,7 +41,7 @@ impl Overrides {
         run.target_success = self.target_success.unwrap_or(run.target_success);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
-            // What was derived from the team size is derived anew; what was chosen stays.
+            // Keys that were derived from the team size are derived again; keys that were set stay.
             let derived = config.collect.episodes_per_iteration == config.derived_episodes();
             config.task = config.task.resized(agents);
             if derived {
@@ -52,16 +53,16 @@ impl Overrides {
     }
 }
 
-/// Reads a configuration file, or takes the defaults.
-pub(crate) fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
+/// Reads a configuration file; without one, the defaults.
+pub fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
     let Some(path) = path else { return Ok(RunConfig::default()) };
     let text = std::fs::read_to_string(path)
         .map_err(|error| usage(format!("configuration file {}: {error}", path.display())))?;
     RunConfig::from_toml(&text).with_context(|| path.display().to_string())
 }
 
-/// Reads the name of something that the configuration knows.
-pub(crate) fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
+/// Parses a name of the configuration, such as an executor.
+pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     serde_json::from_value(text.into()).map_err(|error| error.to_string().replace("unknown variant", "unknown name"))
 }
 
@@ -70,29 +71,24 @@ pub(crate) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// A number of threads, at least 1.
+/// Parses a number of threads.
 pub(crate) fn threads(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(0) => Err("0 threads do nothing; use 1 or more".into()),
-        Ok(count @ 1..=1024) => Ok(count),
-        _ => Err("use a number from 1 to 1024".into()),
-    }
+    within(text, 1024).map(|count| count as usize)
 }
 
-/// A number of actors, at least 1.
+/// Parses a number of actors.
 pub(crate) fn actors(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(count @ 1..=256) => Ok(count),
-        _ => Err("use a number from 1 to 256".into()),
-    }
+    within(text, 256).map(|count| count as usize)
 }
 
-/// A count of at least 1.
-pub(crate) fn count(text: &str) -> Result<u32, String> {
-    match text.parse() {
-        Ok(count @ 1..=1_000_000) => Ok(count),
-        _ => Err("use a number from 1 to 1000000".into()),
-    }
+/// Parses a count.
+pub fn count(text: &str) -> Result<u32, String> {
+    within(text, 1_000_000)
+}
+
+fn within(text: &str, most: u32) -> Result<u32, String> {
+    let number = text.parse().ok().filter(|number| (1..=most).contains(number));
+    number.ok_or_else(|| format!("use a number from 1 to {most}"))
 }
 
 #[cfg(test)]

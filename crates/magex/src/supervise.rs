@@ -1,12 +1,10 @@
-//! `magex train` with services: a learner, a commander and actors as processes of this machine, watched over.
+//! `magex train` with services: a learner, a commander and actors as supervised child processes.
 //!
-//! Whatever crashes is started again: the learner continues from its checkpoint on the same port, the others find it
-//! again by themselves, and the result is the same. The services hold a pipe to this process and stop when it is gone.
+//! A service that crashes is restarted: the learner continues from its checkpoint on the same port, the others reconnect,
+//! and the result is the same. The services hold a pipe to this process and stop when it ends.
 
-pub(crate) mod service;
+pub mod service;
 
-use crate::commands::train::{End, Job, trainer};
-use crate::failure::coded;
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
@@ -16,8 +14,8 @@ use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::watch_run_response::Event;
 use magex_runtime::{client, exit, shutdown};
-use service::{Service, keep};
-use std::process::ExitStatus;
+use service::{Service, code_of, keep};
+use std::path::Path;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -26,59 +24,78 @@ use tokio_util::sync::CancellationToken;
 /// The learner may die this often without completing an iteration in between.
 const LIVES: u32 = 4;
 
-/// Rollout threads and processes.
+/// How a training run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum TrainEnd {
+    /// Target reached or budget spent; summary.json exists.
+    Finished,
+    /// Stopped before the end; the run can be resumed.
+    Stopped,
+}
+
+/// Actor processes and their threads.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Crew {
-    /// Actor processes.
+pub(crate) struct ActorPlan {
+    /// Number of processes.
     pub(crate) actors: usize,
-    /// Threads of each.
+    /// Rollout threads of each.
     pub(crate) threads: usize,
 }
 
-/// Runs a job on services of this machine.
-pub(crate) fn run(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Result<End> {
-    // The run begins, or is checked, here: what is wrong with it is said to the person, not to a log file, and the
-    // learner always continues from a checkpoint, the first time like any other.
-    drop(trainer(job)?);
-    let logs = job.folder.join("logs");
+/// The run that the services train.
+#[derive(Debug)]
+pub(crate) struct ServicesPlan<'a> {
+    /// Run folder with a checkpoint.
+    pub(crate) folder: &'a Path,
+    /// Training threads of the learner.
+    pub(crate) threads: usize,
+    /// Address of the live page, if there is one.
+    pub(crate) http: Option<&'a str>,
+    /// The actors.
+    pub(crate) actors: ActorPlan,
+}
+
+/// Trains on services of this machine until the run is complete or interrupted.
+pub(crate) fn run(plan: &ServicesPlan<'_>, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
+    let logs = plan.folder.join("logs");
     std::fs::create_dir_all(&logs).with_context(|| logs.display().to_string())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-    let end = runtime.block_on(supervise(job, crew, progress));
+    let end = runtime.block_on(supervise(plan, &logs, progress));
     runtime.shutdown_background();
     end
 }
 
-async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Result<End> {
+async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
     let interrupted = shutdown::on_signal()?;
-    let logs = job.folder.join("logs");
-    let service = |name: &str, arguments: &[&str]| Service::new(name, arguments, &logs);
-    let (out, threads) = (job.folder.display().to_string(), job.threads.to_string());
+    let (out, threads) = (plan.folder.display().to_string(), plan.threads.to_string());
     let learner = |listen: &str, http: Option<&str>| {
         let own: [&str; 8] = ["learner", "--resume", "--out", &out, "--threads", &threads, "--listen", listen];
         let page = http.map(|http| ["--http", http]);
-        service("learner", &own.into_iter().chain(page.into_iter().flatten()).collect::<Vec<_>>())
+        Service::new("learner", &own.into_iter().chain(page.into_iter().flatten()).collect::<Vec<_>>(), logs)
     };
-    let mut running = learner("127.0.0.1:0", job.http.as_deref())?.start().await?;
-    let (address, http) = (running.address.clone(), running.http.clone());
-    if let Some(http) = &http {
+    let mut running = learner("127.0.0.1:0", plan.http).start().await?;
+    // A restarted learner listens on the same ports, so that the other services and the page find it again.
+    let learner = learner(&running.address, running.http.as_deref());
+    if let Some(http) = &running.http {
         progress.page(http);
     }
-    let url = format!("http://{address}");
-    let commander = service("commander", &["commander", "--learner", &url, "--listen", "127.0.0.1:0"])?.start().await?;
-    let commander_url = format!("http://{}", commander.address);
+    let url = format!("http://{}", running.address);
+    let commander =
+        |listen: &str| Service::new("commander", &["commander", "--learner", &url, "--listen", listen], logs);
+    let first = commander("127.0.0.1:0").start().await?;
+    let commander_url = format!("http://{}", first.address);
     tracing::debug!(learner = url, commander = commander_url, "services");
 
     let stop = CancellationToken::new();
-    let mut helpers = JoinSet::new();
-    let again = service("commander", &["commander", "--learner", &url, "--listen", &commander.address])?;
-    helpers.spawn(keep(again, commander, stop.clone()));
-    for index in 0..crew.actors {
-        let (name, threads) = (format!("actor-{index}"), crew.threads.to_string());
+    let mut services = JoinSet::new();
+    services.spawn(keep(commander(&first.address), first, stop.clone()));
+    for index in 0..plan.actors.actors {
+        let (name, threads) = (format!("actor-{index}"), plan.actors.threads.to_string());
         let arguments =
             ["actor", "--name", &name, "--learner", &url, "--commander", &commander_url, "--threads", &threads];
-        let actor = service(&name, &arguments)?;
+        let actor = Service::new(&name, &arguments, logs);
         let first = actor.start().await?;
-        helpers.spawn(keep(actor, first, stop.clone()));
+        services.spawn(keep(actor, first, stop.clone()));
     }
 
     let (sender, mut events) = mpsc::channel(64);
@@ -92,50 +109,40 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
                     lives = LIVES;
                 }
             }
-            status = running.wait() => match code_of(status?) {
-                (Some(exit::OK), _) => break Ok(End::Finished),
-                (Some(exit::TEMPORARY), _) => break Ok(End::Stopped),
-                (code, status) => {
-                    lives -= 1;
-                    let reason = running.last_words(status);
-                    if lives == 0 || code.is_some_and(|code| [exit::USAGE, exit::CANNOT_CREATE].contains(&code)) {
-                        let code = code.unwrap_or(exit::FAILURE);
-                        break Err(coded(code, format!("the learner failed: {reason} (log: {out}/logs/learner.log)")));
-                    }
-                    tracing::warn!(reason, "the learner died; starting it again from its checkpoint");
-                    tokio::time::sleep(Duration::from_millis(200)).await;
-                    // A start that fails (killed again, the port still taken) costs a life like any other death.
-                    running = loop {
-                        match learner(&address, http.as_deref())?.start().await {
-                            Ok(running) => break running,
-                            Err(error) if lives <= 1 => return Err(error),
-                            Err(error) => {
-                                lives -= 1;
-                                tracing::warn!(%error, "the learner could not be started; trying again");
-                                tokio::time::sleep(Duration::from_secs(1)).await;
-                            }
-                        }
-                    };
+            status = running.wait() => {
+                let status = status?;
+                let (code, reason) = (code_of(status), running.failure(status));
+                match code {
+                    Some(exit::OK) => break Ok(TrainEnd::Finished),
+                    Some(exit::TEMPORARY) => break Ok(TrainEnd::Stopped),
+                    _ => lives -= 1,
                 }
+                if lives == 0 || code.is_some_and(|code| [exit::USAGE, exit::CANNOT_CREATE].contains(&code)) {
+                    break Err(learner.gave_up(code, &reason));
+                }
+                tracing::warn!(reason, "the learner died; restarting it from its checkpoint");
+                let mut waits = [200].into_iter().chain(std::iter::repeat(1000));
+                let wait = || Duration::from_millis(waits.next().unwrap_or(1000));
+                running = learner.restart(&mut lives, wait).await?;
             },
-            Some(helper) = helpers.join_next() => {
-                if let Err(error) = helper.map_err(anyhow::Error::from).and_then(|result| result) {
+            Some(ended) = services.join_next() => {
+                if let Err(error) = ended.map_err(anyhow::Error::from).and_then(|result| result) {
                     running.stop().await;
                     break Err(error);
                 }
             }
             () = interrupted.cancelled(), if !draining => {
                 draining = true;
-                progress.status("finishing the iteration, then writing a checkpoint");
+                progress.status("stopping after this iteration");
                 note("finishing the iteration, then writing a checkpoint");
                 if let Err(error) = drain(&url).await {
-                    tracing::warn!(%error, "the learner cannot be asked to drain; stopping it");
+                    tracing::warn!(%error, "the drain request failed; stopping the learner");
                     running.terminate();
                 }
             }
         }
     };
-    // What the learner said last is still on its way.
+    // The last events of the learner may still be in transit.
     let rest = async {
         while let Some(event) = events.recv().await {
             if is_new(&event, &mut shown) {
@@ -143,24 +150,14 @@ async fn supervise(job: &Job, crew: Crew, progress: &mut Progress) -> anyhow::Re
             }
         }
     };
-    watching_ends(watching, rest).await;
+    let _ = tokio::time::timeout(Duration::from_millis(100), rest).await;
+    watching.abort();
     stop.cancel();
-    while helpers.join_next().await.is_some() {}
+    while services.join_next().await.is_some() {}
     end
 }
 
-/// Takes in what is left of the events: the stream ends with the learner.
-async fn watching_ends(watching: tokio::task::JoinHandle<()>, rest: impl Future<Output = ()>) {
-    let _ = tokio::time::timeout(Duration::from_millis(100), rest).await;
-    watching.abort();
-}
-
-/// The exit code, unless it was killed by a signal.
-fn code_of(status: ExitStatus) -> (Option<u8>, ExitStatus) {
-    (status.code().and_then(|code| u8::try_from(code).ok()), status)
-}
-
-/// A learner that was started again, and a stream that broke, tell of iterations that were shown before.
+/// A restarted learner and a reconnected stream repeat iterations that were shown before.
 fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
     let RunEvent::Iteration(report) = event else { return true };
     let trained =
@@ -181,7 +178,7 @@ async fn drain(url: &str) -> anyhow::Result<()> {
     tokio::time::timeout(Duration::from_secs(3), call).await?
 }
 
-/// Follows the run, across restarts of the learner.
+/// Follows the events of the run, across restarts of the learner.
 async fn watch(url: String, events: mpsc::Sender<RunEvent>) {
     while !events.is_closed() {
         if let Err(error) = follow(&url, &events).await {

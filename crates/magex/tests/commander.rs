@@ -113,11 +113,11 @@ fn it_does_not_open_itself_to_others_by_accident() {
         }
     };
     refused(&["--listen", "0.0.0.0:0"], &["--tls-cert and --tls-key, and --identities", "--insecure"]);
-    let identities = folder.path().join("who.toml");
+    let identities = folder.path().join("clients.toml");
     let hash = "ab".repeat(32);
     std::fs::write(&identities, format!("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = '{hash}'")).unwrap();
-    let who = identities.display().to_string();
-    refused(&["--listen", "0.0.0.0:0", "--identities", &who], &["add --tls-cert and --tls-key, or --insecure"]);
+    let clients = identities.display().to_string();
+    refused(&["--listen", "0.0.0.0:0", "--identities", &clients], &["add --tls-cert and --tls-key, or --insecure"]);
     refused(&["--identities", "nowhere.toml"], &["nowhere.toml"]);
     refused(&["--tls-cert", "a.pem"], &["--tls-key"]);
     refused(&["--weights", "nowhere"], &["nowhere"]);

@@ -1,11 +1,11 @@
 //! The live page as an observer of the run.
 
-use crate::page::{LivePage, Phase, RunEnd};
 use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::{RunObserver, RunStart};
 use crate::run_events::IterationReport;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::weights::Weights;
+use magex_viewer::page::{LivePage, Phase, RunEnd};
 use std::sync::Arc;
 
 impl RunObserver for Arc<LivePage> {

@@ -1,11 +1,11 @@
 //! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
 
-use crate::page::{Phase, RunEnd};
 use crate::report::metrics_file::{FileError, IterationMetrics};
 use crate::run_events::{IterationReport, RunEvent};
 use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::weights::Weights;
+use magex_viewer::page::{Phase, RunEnd};
 use std::fmt::Debug;
 use std::path::Path;
 use std::time::Duration;

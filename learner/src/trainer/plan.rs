@@ -4,7 +4,7 @@ use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 
 /// Limit of the episodes of an evaluation shard.
-pub(super) const EVAL_SHARD_EPISODES: u32 = 16;
+const EVAL_SHARD_EPISODES: u32 = 16;
 /// Evaluation set while training.
 pub const EVAL_SET_TRAINING: u32 = 1;
 /// Evaluation set that closes a run: other spawns than any set before.

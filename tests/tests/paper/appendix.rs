@@ -1,14 +1,15 @@
 //! The appendix: the Hungarian algorithm, observations, tables of hyperparameters.
 
-use crate::support::{actor_shapes, stream};
+use crate::support::{actor, actor_shapes, stream};
 use magex_assign::exact_points;
 use magex_core::config::{CommanderConfig, CommanderPolicy, ExecutorKind, RunConfig};
+use magex_core::joint_state::JointState;
+use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_learner::train::adam::Adam;
 use magex_learner::train::gae::ValueNorm;
 use magex_learner::train::mappo::Mappo;
 use magex_nets::commander::Commander;
-use magex_nets::features::JointStates;
 use magex_tests::small;
 
 // Appendix A.
@@ -54,12 +55,13 @@ fn appendix_a_2_the_literal_executor_sees_absolute_positions_and_ours_relative_o
         config.task = task.clone();
         let spec = *Mappo::new(&config).unwrap().spec();
         let seen = |shift: f32| {
-            let (positions, landmarks) = ([0.5 + shift, 0.25], [1.0 + shift, 0.75]);
-            spec.compute(&JointStates {
+            let positions = [0.5 + shift, 0.25];
+            let statics = Statics::landmarks(1, 2, vec![1.0 + shift, 0.75]);
+            spec.compute(&JointState {
                 positions: &positions,
                 velocities: &[0.5, 0.0],
                 agent_state: &[],
-                landmarks: &landmarks,
+                statics: statics.view(),
                 goals: &[0],
             })
             .goals
@@ -103,13 +105,13 @@ fn appendix_table_mappo_hyperparameters() {
 #[test]
 fn appendix_table_mappo_hyperparameters_orthogonal_initialisation() {
     let mappo = Mappo::new(&small(ExecutorKind::Magex, 5, 1)).unwrap();
-    let actor = mappo.start().unwrap().actor;
+    let actor = actor(&mappo);
     // Every weight matrix [rows, columns]: the shorter side is an orthogonal basis times the layer's gain.
     let matrices = actor.entries.iter().filter(|entry| entry.shape.len() == 2);
     let mut checked = 0;
     for entry in matrices {
         let (rows, columns) = (entry.shape[0], entry.shape[1]);
-        let at = |i: usize, j: usize| f64::from(actor.numbers[entry.start + i * columns + j]);
+        let at = |i: usize, j: usize| f64::from(actor.values[entry.start + i * columns + j]);
         let vector = |k: usize| -> Vec<f64> {
             if rows <= columns {
                 (0..columns).map(|j| at(k, j)).collect()
@@ -146,7 +148,7 @@ fn appendix_table_architecture_hyperparameters() {
     // f_sche: 4N positions in, N scores out. Deviation: two hidden layers as in the authors' code, where one layer of 4N × N is
     // linear and cannot rank.
     let kind = CommanderPolicy::Ranking;
-    let params = Commander::start(&CommanderConfig { kind, ..CommanderConfig::default() }, 7, 2, 1).unwrap();
+    let params = Commander::init(&CommanderConfig { kind, ..CommanderConfig::default() }, 7, 2, 1).unwrap();
     let weights: Vec<&Vec<usize>> =
         params.entries.iter().map(|entry| &entry.shape).filter(|shape| shape.len() == 2).collect();
     assert_eq!((weights.first().unwrap()[0], weights.last().unwrap()[1]), (4 * 7, 7));
@@ -155,8 +157,7 @@ fn appendix_table_architecture_hyperparameters() {
 #[test]
 fn appendix_c_2_one_set_of_parameters_is_shared_by_all_agents() {
     // MAPPO "equips all agents with one shared set of parameters": the actor's size does not depend on N.
-    let count =
-        |agents| Mappo::new(&small(ExecutorKind::Magex, agents, 1)).unwrap().start().unwrap().actor.numbers.len();
+    let count = |agents| actor(&Mappo::new(&small(ExecutorKind::Magex, agents, 1)).unwrap()).values.len();
     assert_eq!(count(3), count(50));
     assert!(count(5) > 5_000);
 }

@@ -3,6 +3,7 @@
 use crate::support::{actor_shapes, positions, run, scheduler, stream};
 use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
+use magex_core::metrics_table::SUCCESS_RATE;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_env::{Env as _, Spread, new_env};
 use magex_nets::commander::Team;
@@ -62,7 +63,7 @@ fn section_5_1_2_push_ball() {
 fn section_5_1_3_drones() {
     for agents in [2, 4] {
         let task = TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform);
-        assert_eq!((task.horizon, task.drones.physics_hz, task.dims()), (120, 120, 3));
+        assert_eq!((task.horizon, task.drones().unwrap().physics_hz, task.dims()), (120, 120, 3));
         assert_eq!(task.action_heads(), [3, 3, 3], "forward, backward, stop along each axis");
         let mut env = new_env(&task, (0..50).map(stream), false).unwrap();
         for points in [positions(&*env, &task), env.landmarks().to_vec()] {
@@ -94,7 +95,7 @@ fn section_5_2_success_is_the_share_of_landmarks_reached_at_the_end_over_100_epi
     let mut env = Spread::from_state(&task, &[0.1, 0.0, 2.1, 0.0, 4.1, 0.0, 6.0, 0.0], &[0.0; 8], &landmarks).unwrap();
     env.set_goals(&[0, 2, 1, 3]).unwrap();
     env.step(&[0; 4], &mut [0.0; 4]).unwrap();
-    assert_eq!(env.scores()[0].success, 0.75);
+    assert_eq!(env.scores()[0][SUCCESS_RATE], 0.75);
 }
 
 // Section 5.5, ablations.

@@ -1,11 +1,11 @@
 //! Sections 3 and 4: preliminary, Goal Commander, Action Executor, Algorithm 1.
 
-use crate::support::{act, run, scheduler, scores, stream};
+use crate::support::{act, network, run, scheduler, scores, stream};
 use candle_core::{Device, Tensor};
 use magex_assign::exact_points;
 use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{RewardConfig, Spawn, TaskConfig, TaskSettings};
 use magex_core::trajectory::Trajectory;
 use magex_env::{Env as _, Spread};
 use magex_learner::train::gae::Gae;
@@ -142,7 +142,7 @@ fn equation_4_the_reward_of_the_commander_is_one_minus_the_cost_ratio() {
     for t in &trajectories {
         for b in 0..t.shape.episodes {
             let agents = &t.positions[b * 10..(b + 1) * 10];
-            let landmarks = &t.landmarks[b * 10..(b + 1) * 10];
+            let landmarks = &t.statics.get("landmarks")[b * 10..(b + 1) * 10];
             let distance =
                 |i: usize, g: usize| (agents[2 * i] - landmarks[2 * g]).hypot(agents[2 * i + 1] - landmarks[2 * g + 1]);
             let cost: f32 = (0..5).map(|i| distance(i, t.goals[b * 5 + i] as usize)).sum();
@@ -158,7 +158,8 @@ fn equation_4_the_reward_of_the_commander_is_one_minus_the_cost_ratio() {
 #[test]
 fn equation_5_the_reward_of_an_agent_is_bonus_minus_distance_minus_collisions() {
     let mut task = TaskConfig { horizon: 10, ..TaskConfig::simple_spread(3, Spawn::Uniform) };
-    (task.reward.bonus, task.reward.distance, task.reward.collision, task.reward.distance_unit) = (1.5, 2.0, 0.7, 4.0);
+    task.settings =
+        TaskSettings::SimpleSpread(RewardConfig { bonus: 1.5, distance: 2.0, collision: 0.7, distance_unit: 4.0 });
     // Agent 0 on its landmark, agents 1 and 2 on their way into each other and away from theirs.
     let (start, landmarks) = ([0.0, 0.0, 2.0, 0.0, 2.3, 0.0], [0.1, 0.0, 4.0, 0.0, 2.0, 3.0]);
     let mut env = Spread::from_state(&task, &start, &[0.0, 0.0, 1.0, 0.0, -1.0, 0.0], &landmarks).unwrap();
@@ -238,13 +239,13 @@ fn algorithm_1_lines_3_to_14_goals_once_per_episode_then_a_step_at_a_time() {
 #[test]
 fn algorithm_1_line_19_an_iteration_updates_every_network() {
     let (_, before, after) = run(&small(ExecutorKind::Magex, 5, 1));
-    assert_ne!(before.executor.actor, after.executor.actor, "θ'");
-    assert_ne!(before.executor.critic, after.executor.critic, "φ'");
+    assert_ne!(network(&before, "actor").params, network(&after, "actor").params, "θ'");
+    assert_ne!(network(&before, "critic").params, network(&after, "critic").params, "φ'");
     // Deviation: the commander has no value network φ; one decision per episode is compared with the greedy decision on the same
     // team, whose cost is known at once. Where both agree nothing is learned, so more than one iteration is looked at.
     let (_, before, after) = run(&small(ExecutorKind::Local, 5, 4));
-    assert_ne!(before.commander.params, after.commander.params, "θ");
-    assert_ne!(before.executor.value_norm, after.executor.value_norm);
+    assert_ne!(network(&before, "commander").params, network(&after, "commander").params, "θ");
+    assert_ne!(before.value_norm, after.value_norm);
 }
 
 #[test]
@@ -263,7 +264,8 @@ fn section_4_3_the_surrogate_is_clipped_and_the_first_step_is_not() {
     let learned = |epochs: u32, clip: f32| {
         let mut config = small(ExecutorKind::Local, 5, 1);
         (config.mappo.epochs, config.mappo.minibatch_size, config.mappo.clip_epsilon) = (epochs, 100_000, clip);
-        run(&config).2.executor
+        let learned = run(&config).2;
+        (["actor", "critic"].map(|name| network(&learned, name).clone()), learned.value_norm)
     };
     // One step: every ratio is 1 and every value the old one, so the limits cannot matter. From the second step on they do.
     assert_eq!(learned(1, 0.001), learned(1, 0.2));
@@ -275,7 +277,7 @@ fn section_4_3_the_value_loss_is_linear_beyond_delta() {
     let critic = |delta: f32| {
         let mut config = small(ExecutorKind::Local, 5, 1);
         config.mappo.huber_delta = delta;
-        run(&config).2.executor.critic
+        network(&run(&config).2, "critic").params.clone()
     };
     // Targets are normalised: no error of this run is as large as 10, many are larger than 0.01.
     assert_eq!(critic(10.0), critic(1e6));

@@ -4,44 +4,52 @@ use candle_core::Tensor;
 use magex::local::LocalCollector;
 use magex_core::config::{CanonicalOrder, CommanderConfig, CommanderPolicy, RunConfig};
 use magex_core::ids::{RunId, Shard};
+use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::statics::Statics;
 use magex_core::task::TaskConfig;
 use magex_core::trajectory::{ShardResult, Trajectory};
 use magex_env::Env;
-use magex_learner::checkpoint::Learned;
 use magex_learner::collector::Collector;
-use magex_learner::run_events::{CollectError, RunEvent, StopReason};
+use magex_learner::run_events::{CollectError, StopReason};
+use magex_learner::train::learned::{Learned, Network};
 use magex_learner::train::mappo::Mappo;
-use magex_learner::trainer::{Outcome, Trainer};
+use magex_learner::trainer::{TrainOutcome, Trainer};
 use magex_nets::commander::{Commander, Team};
 use magex_nets::executor::{self, Input};
-use magex_nets::features::JointStates;
 use magex_nets::ops::GraphNoise;
-use magex_nets::params::Params;
+use magex_nets::params::{ParamBuilder, Params};
 use magex_proto::weights::Weights;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::sync::mpsc::channel;
+
+/// Parameters of a fresh actor.
+pub(crate) fn actor(mappo: &Mappo) -> Params {
+    mappo.init().unwrap().into_iter().find(|network| network.name == "actor").unwrap().params
+}
+
+/// Parameters and optimiser of a network.
+pub(crate) fn network<'a>(learned: &'a Learned, name: &str) -> &'a Network {
+    learned.network(name).unwrap()
+}
 
 /// Shapes of the tensors of a fresh actor, by name.
 pub(crate) fn actor_shapes(config: &RunConfig) -> BTreeMap<String, Vec<usize>> {
-    let actor = Mappo::new(config).unwrap().start().unwrap().actor;
-    actor.entries.iter().map(|entry| (entry.name.clone(), entry.shape.clone())).collect()
+    actor(&Mappo::new(config).unwrap()).entries.iter().map(|entry| (entry.name.clone(), entry.shape.clone())).collect()
 }
 
 /// [N, A] logits of a fresh actor for one joint state in 2-D, and the memory after the step. Agent i's goal is landmark i.
 pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: Option<u64>) -> (Vec<f32>, Vec<f32>) {
     let mappo = Mappo::new(config).unwrap();
-    let actor = mappo.start().unwrap().actor;
     let n = config.task.agents;
-    let mut source = actor.source(actor.plain().unwrap());
-    let network = executor::build(&config.executor, mappo.spec(), n, 5, 0.01, &mut source).unwrap();
-    let landmarks: Vec<f32> = (0..2 * n).map(|k| 0.3 * k as f32).collect();
+    let mut params = ParamBuilder::with(actor(&mappo).tensors().unwrap());
+    let network = executor::build(&config.executor, mappo.spec(), n, 5, 0.01, &mut params).unwrap();
+    let statics = Statics::landmarks(n, 2, (0..2 * n).map(|k| 0.3 * k as f32).collect());
     let goals: Vec<u32> = (0..n as u32).collect();
     let velocities = vec![0.0; positions.len()];
     let states =
-        JointStates { positions, velocities: &velocities, agent_state: &[], landmarks: &landmarks, goals: &goals };
+        JointState { positions, velocities: &velocities, agent_state: &[], statics: statics.view(), goals: &goals };
     let noise = noise.map_or(GraphNoise::Off, |key| GraphNoise::Keyed(Arc::new(vec![key])));
     let features = mappo.spec().compute(&states);
     let input = Input { steps: 1, sequences: 1, agents: n, features: &features, hidden: hidden.to_vec(), noise };
@@ -53,8 +61,8 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
 /// A fresh scheduler for N agents in 2-D.
 pub(crate) fn scheduler(kind: CommanderPolicy, agents: usize) -> Commander {
     let config = CommanderConfig { kind, order: CanonicalOrder::X, ..CommanderConfig::default() };
-    let params: Params = Commander::start(&config, agents, 2, 3).unwrap();
-    Commander::build(&config, agents, 2, &mut params.source(params.plain().unwrap())).unwrap()
+    let params = Commander::init(&config, agents, 2, 3).unwrap();
+    Commander::of(&config, agents, 2, &params).unwrap()
 }
 
 pub(crate) fn scores(commander: &Commander, team: &Team<'_>) -> Vec<f32> {
@@ -92,10 +100,6 @@ impl Collector for Watching {
         Ok(results)
     }
 
-    fn event(&mut self, event: RunEvent) {
-        self.inner.event(event);
-    }
-
     fn stop_requested(&self) -> Option<StopReason> {
         self.inner.stop_requested()
     }
@@ -106,8 +110,8 @@ pub(crate) fn run(config: &RunConfig) -> (Vec<Trajectory>, Learned, Learned) {
     let folder = tempfile::tempdir().unwrap();
     let mut trainer = Trainer::create(config, RunId("paper".into()), folder.path(), 1).unwrap();
     let before = trainer.learned().clone();
-    let inner = LocalCollector::new(config, 1, channel::<RunEvent>().0, Arc::new(AtomicBool::new(false)));
+    let inner = LocalCollector::new(config, 1, Arc::new(AtomicBool::new(false)));
     let mut collector = Watching { inner, seen: Vec::new() };
-    assert!(matches!(trainer.run(&mut collector).unwrap(), Outcome::Finished(_)));
+    assert!(matches!(trainer.run(&mut collector).unwrap(), TrainOutcome::Finished(_)));
     (collector.seen, before, trainer.learned().clone())
 }

@@ -15,7 +15,6 @@ mod missions;
 mod results;
 mod sandbox;
 mod security;
-mod speed;
 mod stopping;
 mod swaps;
 mod weights;

@@ -3,15 +3,16 @@
 //! Plain multiplications and additions in a fixed order: the same bits on every machine.
 
 /// A vector.
-pub(crate) type V3 = [f64; 3];
+pub type V3 = [f64; 3];
 
 #[inline]
 pub(crate) fn add(a: V3, b: V3) -> V3 {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
+/// a − b.
 #[inline]
-pub(crate) fn sub(a: V3, b: V3) -> V3 {
+pub fn sub(a: V3, b: V3) -> V3 {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
@@ -36,19 +37,20 @@ pub(crate) fn cross(a: V3, b: V3) -> V3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
+/// Euclidean length.
 #[inline]
-pub(crate) fn norm(a: V3) -> f64 {
+pub fn norm(a: V3) -> f64 {
     libm::sqrt(dot(a, a))
 }
 
 /// A rotation matrix, rows outside.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Mat3(pub(crate) [V3; 3]);
+pub struct Mat3(pub [V3; 3]);
 
 impl Mat3 {
     /// The rotation of a unit quaternion.
     #[inline]
-    pub(crate) fn of([x, y, z, w]: [f64; 4]) -> Self {
+    pub fn of([x, y, z, w]: [f64; 4]) -> Self {
         let (x2, y2, z2) = (x + x, y + y, z + z);
         let (xx, yy, zz) = (x * x2, y * y2, z * z2);
         let (xy, xz, yz) = (x * y2, x * z2, y * z2);
@@ -62,32 +64,32 @@ impl Mat3 {
 
     /// The matrix whose columns are three vectors.
     #[inline]
-    pub(crate) fn columns(x: V3, y: V3, z: V3) -> Self {
+    pub fn columns(x: V3, y: V3, z: V3) -> Self {
         Self([[x[0], y[0], z[0]], [x[1], y[1], z[1]], [x[2], y[2], z[2]]])
     }
 
     /// Body axis k in the world.
     #[inline]
-    pub(crate) fn axis(&self, k: usize) -> V3 {
+    pub fn axis(&self, k: usize) -> V3 {
         [self.0[0][k], self.0[1][k], self.0[2][k]]
     }
 
     /// Body to world.
     #[inline]
-    pub(crate) fn turn(&self, v: V3) -> V3 {
+    pub fn turn(&self, v: V3) -> V3 {
         [dot(self.0[0], v), dot(self.0[1], v), dot(self.0[2], v)]
     }
 
     /// World to body.
     #[inline]
-    pub(crate) fn back(&self, v: V3) -> V3 {
+    pub fn back(&self, v: V3) -> V3 {
         [dot(self.axis(0), v), dot(self.axis(1), v), dot(self.axis(2), v)]
     }
 }
 
 /// The product of two quaternions: first `b`, then `a`.
 #[inline]
-pub(crate) fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+pub fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     [
         a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
         a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0],

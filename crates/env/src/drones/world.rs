@@ -20,7 +20,7 @@ const RESTING: u32 = 15;
 
 /// Why a drone is out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Crash {
+pub enum Crash {
     /// It touched another drone.
     Contact,
     /// It touched the ground.
@@ -33,12 +33,12 @@ pub(crate) enum Crash {
 
 /// A drone.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Drone {
+pub struct Drone {
     pub(crate) motion: Motion,
     /// Pose before the previous step.
     before: Pose,
     /// rpm of the previous step.
-    pub(crate) rpm_before: [f64; 4],
+    pub rpm_before: [f64; 4],
     pub(crate) crash: Option<Crash>,
     /// Does not move any more.
     pub(crate) fixed: bool,
@@ -48,7 +48,7 @@ pub(crate) struct Drone {
 
 impl Drone {
     /// A drone with a state, as if it had been there before.
-    pub(crate) fn at(state: &State) -> Self {
+    pub fn at(state: &State) -> Self {
         let vector = |v: [f64; 3]| Vector::new(v[0] as f32, v[1] as f32, v[2] as f32);
         let [x, y, z, w] = state.attitude.map(|c| c as f32);
         let rotation = Rotation::from_xyzw(x, y, z, w);
@@ -66,7 +66,8 @@ impl Drone {
         }
     }
 
-    pub(crate) fn state(&self) -> State {
+    /// Its state in f64.
+    pub fn state(&self) -> State {
         let vector = |v: Vector| v.to_array().map(f64::from);
         State {
             position: vector(self.motion.pose.translation),
@@ -77,7 +78,7 @@ impl Drone {
     }
 
     /// Sets the attitude before the previous step.
-    pub(crate) fn remember(&mut self, attitude: [f64; 4]) {
+    pub fn remember(&mut self, attitude: [f64; 4]) {
         let [x, y, z, w] = attitude.map(|c| c as f32);
         self.before.rotation = Rotation::from_xyzw(x, y, z, w);
     }
@@ -87,7 +88,8 @@ impl Drone {
         Pose::from_parts(0.5 * (self.before.translation + self.motion.pose.translation), self.motion.pose.rotation)
     }
 
-    pub(crate) fn is_out(&self) -> bool {
+    /// Whether it has crashed.
+    pub fn is_out(&self) -> bool {
         self.crash.is_some()
     }
 
@@ -116,20 +118,21 @@ pub(crate) fn quaternion(r: Rotation) -> [f64; 4] {
 
 /// What is the same for all worlds of a task.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Laws {
+pub struct Laws {
     pub(crate) craft: Craft,
     pub(crate) effects: Effects,
     pub(crate) downwash: Downwash,
     /// Seconds per physics step.
     pub(crate) dt: f64,
     /// Run rapier's pipeline in every step (for checks).
-    pub(crate) always: bool,
+    pub always: bool,
     properties: MassProperties,
     parameters: IntegrationParameters,
 }
 
 impl Laws {
-    pub(crate) fn new(craft: Craft, effects: Effects, downwash: Downwash, dt: f64) -> Self {
+    /// Laws for drones of this kind.
+    pub fn new(craft: Craft, effects: Effects, downwash: Downwash, dt: f64) -> Self {
         let parameters = parameters(dt as f32, craft.most_speed as f32);
         Self {
             craft,
@@ -152,8 +155,9 @@ impl Laws {
 }
 
 /// The drones of an episode.
-pub(crate) struct World {
-    pub(crate) drones: Vec<Drone>,
+pub struct World {
+    /// `[N]`
+    pub drones: Vec<Drone>,
     /// Made when something first comes within its reach.
     engine: Option<Box<Engine>>,
     /// Force and torque on each drone in this step.
@@ -164,7 +168,8 @@ pub(crate) struct World {
 }
 
 impl World {
-    pub(crate) fn new(drones: Vec<Drone>) -> Self {
+    /// A world of these drones.
+    pub fn new(drones: Vec<Drone>) -> Self {
         let n = drones.len();
         Self {
             drones,
@@ -176,7 +181,7 @@ impl World {
     }
 
     /// One physics step with a command of the motors per drone.
-    pub(crate) fn step(&mut self, laws: &Laws, rpm: &[[f64; 4]]) {
+    pub fn step(&mut self, laws: &Laws, rpm: &[[f64; 4]]) {
         self.find_loads(laws, rpm);
         self.touches.fill(Touch::default());
         let near = laws.always || self.near();

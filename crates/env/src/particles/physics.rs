@@ -9,24 +9,24 @@ use super::real::{Real, softplus};
 
 /// Constants of the world.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Physics<R> {
+pub struct Physics<R> {
     /// Seconds per step.
-    pub(crate) dt: R,
+    pub dt: R,
     /// 1 − damping: the share of the velocity kept.
-    pub(crate) keep: R,
+    pub keep: R,
     /// Stiffness of a contact.
-    pub(crate) contact_force: R,
+    pub contact_force: R,
     /// k, the softness of a contact in world units.
-    pub(crate) margin: R,
+    pub margin: R,
     /// 1 / k.
-    pub(crate) inverse_margin: R,
+    pub inverse_margin: R,
     /// Force of an action.
-    pub(crate) sensitivity: R,
+    pub sensitivity: R,
 }
 
 impl<R: Real> Physics<R> {
     /// From the constants of a recording.
-    pub(crate) fn new(dt: f64, damping: f64, contact_force: f64, margin: f64, sensitivity: f64) -> Self {
+    pub fn new(dt: f64, damping: f64, contact_force: f64, margin: f64, sensitivity: f64) -> Self {
         Self {
             dt: R::from_f64(dt),
             keep: R::from_f64(1.0 - damping),
@@ -43,29 +43,29 @@ impl<R: Real> Physics<R> {
     }
 
     /// Distance from which a contact at `touch` is exactly zero here (see [`Real::NEGLIGIBLE`]).
-    pub(crate) fn reach(&self, touch: R) -> R {
+    pub fn reach(&self, touch: R) -> R {
         R::NEGLIGIBLE.mul_add(self.margin, touch)
     }
 }
 
 /// What two bodies are to each other.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Pair<R> {
+pub struct Pair<R> {
     /// Sum of the radii.
-    pub(crate) touch: R,
+    pub touch: R,
     /// touch²; the pair counts as a hit below it. Negative if it never counts.
-    pub(crate) touch2: R,
+    pub touch2: R,
     /// reach²; no force from it on. Negative if the two never touch.
-    pub(crate) reach2: R,
+    pub reach2: R,
     /// Factor of the force on the first body.
-    pub(crate) on_first: R,
+    pub on_first: R,
     /// Factor of the force on the second body.
-    pub(crate) on_second: R,
+    pub on_second: R,
 }
 
 impl<R: Real> Pair<R> {
     /// Two movable bodies of equal mass.
-    pub(crate) fn equal(physics: &Physics<R>, touch: f64) -> Self {
+    pub fn equal(physics: &Physics<R>, touch: f64) -> Self {
         let touch = R::from_f64(touch);
         let reach = physics.reach(touch);
         Self { touch, touch2: touch * touch, reach2: reach * reach, on_first: R::ONE, on_second: R::ONE }
@@ -73,7 +73,7 @@ impl<R: Real> Pair<R> {
 }
 
 /// The bodies of a world.
-pub(crate) trait Bodies<R> {
+pub trait Bodies<R> {
     /// The pair (i, j), i < j.
     fn pair(&self, i: usize, j: usize) -> Pair<R>;
     /// 1 / mass.
@@ -86,7 +86,7 @@ pub(crate) trait Bodies<R> {
 
 /// Bodies of one size and mass 1: the agents of Simple Spread.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Alike<R>(pub(crate) Pair<R>);
+pub struct Alike<R>(pub Pair<R>);
 
 impl<R: Real> Bodies<R> for Alike<R> {
     #[inline(always)]
@@ -109,7 +109,7 @@ impl<R: Real> Bodies<R> for Alike<R> {
 
 /// Agents, then balls, all of mass 1: the bodies of Push Ball.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct AgentsAndBalls<R> {
+pub struct AgentsAndBalls<R> {
     agents: usize,
     /// Agent and agent, agent and ball, ball and ball.
     pairs: [Pair<R>; 3],
@@ -117,7 +117,7 @@ pub(crate) struct AgentsAndBalls<R> {
 
 impl<R: Real> AgentsAndBalls<R> {
     /// `agents` agents, followed by balls; only agents that overlap with each other count as hits.
-    pub(crate) fn new(physics: &Physics<R>, agents: usize, agent_radius: f64, ball_radius: f64) -> Self {
+    pub fn new(physics: &Physics<R>, agents: usize, agent_radius: f64, ball_radius: f64) -> Self {
         let pair = |touch| Pair::equal(physics, touch);
         let uncounted = |touch| Pair { touch2: -R::ONE, ..pair(touch) };
         let pairs = [pair(2.0 * agent_radius), uncounted(agent_radius + ball_radius), uncounted(2.0 * ball_radius)];
@@ -145,7 +145,7 @@ impl<R: Real> Bodies<R> for AgentsAndBalls<R> {
 }
 
 /// Pairs of bodies in some order, i < j, packed as i · 2^16 + j so that their order is that of the numbers.
-pub(crate) type Pairs = Vec<u32>;
+pub type Pairs = Vec<u32>;
 
 /// The pair (i, j), packed.
 #[inline(always)]
@@ -155,7 +155,7 @@ pub(crate) fn pack(i: usize, j: usize) -> u32 {
 
 /// Lists every pair that is in reach in any of the W worlds, by rising i, then j, at the front of `pairs`; returns how
 /// many there are.
-pub(crate) fn find_pairs<R: Real, const W: usize, B: Bodies<R>>(
+pub fn find_pairs<R: Real, const W: usize, B: Bodies<R>>(
     bodies: &B,
     (x, y): (&[[R; W]], &[[R; W]]),
     pairs: &mut Pairs,
@@ -184,11 +184,13 @@ pub(crate) fn find_pairs<R: Real, const W: usize, B: Bodies<R>>(
 }
 
 /// What contacts do to the bodies, `[bodies][W]` each.
-pub(crate) struct Forces<'a, R, const W: usize> {
-    pub(crate) x: &'a mut [[R; W]],
-    pub(crate) y: &'a mut [[R; W]],
+pub struct Forces<'a, R, const W: usize> {
+    /// Force along x.
+    pub x: &'a mut [[R; W]],
+    /// Force along y.
+    pub y: &'a mut [[R; W]],
     /// Other bodies strictly closer than the sum of radii, as far as they count ([`Pair::touch2`]).
-    pub(crate) hits: &'a mut [[R; W]],
+    pub hits: &'a mut [[R; W]],
 }
 
 impl<R: Real, const W: usize> Forces<'_, R, W> {
@@ -196,7 +198,7 @@ impl<R: Real, const W: usize> Forces<'_, R, W> {
     ///
     /// Lanes in which a pair is apart get exactly +0, which changes no sum: sums start at +0 and round to nearest, so
     /// they are never −0.
-    pub(crate) fn sum<B: Bodies<R>>(
+    pub fn sum<B: Bodies<R>>(
         &mut self,
         physics: &Physics<R>,
         bodies: &B,
@@ -244,18 +246,22 @@ fn add<R: Real, const W: usize>(sum: &mut [R; W], factor: R, term: &[R; W]) {
 }
 
 /// Velocities and positions of W worlds, `[bodies][W]` each.
-pub(crate) struct Motion<'a, R, const W: usize> {
-    pub(crate) x: &'a mut [[R; W]],
-    pub(crate) y: &'a mut [[R; W]],
-    pub(crate) vx: &'a mut [[R; W]],
-    pub(crate) vy: &'a mut [[R; W]],
+pub struct Motion<'a, R, const W: usize> {
+    /// Positions along x.
+    pub x: &'a mut [[R; W]],
+    /// Positions along y.
+    pub y: &'a mut [[R; W]],
+    /// Velocities along x.
+    pub vx: &'a mut [[R; W]],
+    /// Velocities along y.
+    pub vy: &'a mut [[R; W]],
 }
 
 impl<R: Real, const W: usize> Motion<'_, R, W> {
     /// One step under the contact forces (`fx`, `fy`) of the present positions; `control` gives the control
     /// acceleration of a body in every lane.
     #[inline(always)]
-    pub(crate) fn advance<B: Bodies<R>>(
+    pub fn advance<B: Bodies<R>>(
         &mut self,
         physics: &Physics<R>,
         bodies: &B,

@@ -1,7 +1,7 @@
 //! `magex assign`
 
-use crate::cli::Global;
 use crate::failure::{unavailable, usage};
+use crate::options::CommonOptions;
 use crate::output::{Table, note};
 use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
@@ -18,60 +18,60 @@ use tonic::{Code, Status};
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex assign --connect http://127.0.0.1:7100 --agents '[[0,0],[1,0]]' --goals '[[1,1],[0,1]]'
-  magex assign --connect http://127.0.0.1:7100 --agents team.json --scheduler exact
-  generate-team | magex assign --connect http://127.0.0.1:7100 --agents - --json
-  magex assign --connect http://127.0.0.1:7100 --random 50 --seed 7
+  magex assign --agents '[[0,0],[1,0]]' --goals '[[1,1],[0,1]]'
+  magex assign --agents team.json --scheduler exact
+  generate-team | magex assign --agents - --json
+  magex assign --connect http://10.0.0.2:7100 --random 50 --seed 7
 
-A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}; two or three coordinates. With more agents
-than goals some agents get none, and the other way round. gap: how much the summed distance exceeds the
-least possible.
+A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]} with two or
+three coordinates. With more agents than goals some agents get no goal, and
+vice versa. gap: excess of the summed distance over the minimum.
 
-Exit codes: 0 done, 1 the commander refused or failed, 64 wrong usage or positions,
-69 the commander cannot be reached";
+Exit codes: 0 success, 1 the commander rejected the request or failed, 64 wrong
+usage or positions, 69 the commander cannot be reached";
 
-/// Ask a running commander who goes where.
+/// Request goal assignments from a running commander.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct AssignArgs {
     /// The commander's address.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7100", env = "MAGEX_COMMANDER")]
     pub(crate) connect: String,
-    /// What the commander is shown.
+    /// Credentials for the commander.
     #[command(flatten)]
     pub(crate) security: CallerArgs,
-    /// Positions of the agents: JSON, a file, or - for standard input; a team file brings the goals too.
+    /// Positions of the agents: JSON, a file, or - for standard input; a team file contains the goals too.
     #[arg(long, value_name = "FILE|JSON|-", required_unless_present = "random", conflicts_with = "random")]
     pub(crate) agents: Option<String>,
     /// Positions of the goals: JSON or a file.
     #[arg(long, value_name = "FILE|JSON", conflicts_with = "random")]
     pub(crate) goals: Option<String>,
-    /// A random team of N agents and N goals instead, uniform in a square of the task's density.
+    /// Use a random team of N agents and N goals, uniform in a square with the density of the task.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=5000))]
     pub(crate) random: Option<u32>,
-    /// Who hands out the goals.
+    /// Assignment method.
     #[arg(long, value_enum, value_name = "KIND", default_value = "learned")]
     pub(crate) scheduler: Kind,
     /// How the goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
     pub(crate) mode: Choice,
-    /// Fixes what is random.
+    /// Seed of random choices.
     #[arg(long, value_name = "S")]
     pub(crate) seed: Option<u64>,
 }
 
-/// What a commander can be asked for.
+/// Assignment methods.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Kind {
     /// The trained commander.
     Learned,
-    /// The least summed distance.
+    /// Minimal summed distance.
     Exact,
-    /// The nearest free pair, again and again.
+    /// The nearest free pair, repeatedly.
     Greedy,
     /// A random matching.
     Random,
-    /// The smallest largest distance.
+    /// Minimal longest distance.
     Makespan,
 }
 
@@ -92,7 +92,7 @@ struct Team {
     goals: Vec<Vec<f32>>,
 }
 
-pub(crate) fn run(args: &AssignArgs, global: &Global) -> anyhow::Result<u8> {
+pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let team = team(args)?;
     let request = v1::AssignRequest {
         agents: Some(positions("agents", &team.agents)?),
@@ -121,26 +121,26 @@ pub(crate) fn run(args: &AssignArgs, global: &Global) -> anyhow::Result<u8> {
         let mut client = CommanderServiceClient::new(channel);
         let call = client.assign(request);
         match tokio::time::timeout(Duration::from_secs(30), call).await {
-            Ok(answer) => answer.map(tonic::Response::into_inner).map_err(|status| refused(&args.connect, &status)),
+            Ok(answer) => answer.map(tonic::Response::into_inner).map_err(|status| rejected(&args.connect, &status)),
             Err(_) => Err(unavailable(format!("the commander at {} did not answer within 30 s", args.connect))),
         }
     })?;
-    show(args, global, &response, clock.elapsed().as_secs_f64());
+    show(args, options, &response, clock.elapsed().as_secs_f64());
     Ok(exit::OK)
 }
 
-fn refused(url: &str, status: &Status) -> anyhow::Error {
+fn rejected(url: &str, status: &Status) -> anyhow::Error {
     match status.code() {
         Code::InvalidArgument => usage(status.message()),
         Code::Unavailable | Code::DeadlineExceeded | Code::Unimplemented => {
             unavailable(format!("{url}: {}", status.message()))
         }
-        code => anyhow::anyhow!("the commander refused: {code}: {}", status.message()),
+        code => anyhow::anyhow!("the commander rejected the request: {code}: {}", status.message()),
     }
 }
 
-fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round_trip: f64) {
-    let output = global.output();
+fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignResponse, round_trip: f64) {
+    let output = options.output();
     let mut table = Table::new(0, &["agent", "goal", "distance", "probability"]);
     for pair in &response.pairs {
         let name = |name: &str, index: u32| if name.is_empty() { index.to_string() } else { name.to_owned() };
@@ -155,7 +155,7 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
     for (what, left) in [("agents", &response.unassigned_agents), ("goals", &response.unassigned_goals)] {
         if !left.is_empty() {
             let list: Vec<String> = left.iter().map(u32::to_string).collect();
-            output.say(format!("  {what} left over: {}", list.join(", ")));
+            output.say(format!("  unassigned {what}: {}", list.join(", ")));
         }
     }
     let answered = kind_name(response.scheduler());
@@ -166,7 +166,7 @@ fn show(args: &AssignArgs, global: &Global, response: &v1::AssignResponse, round
         }
     };
     output.say(format!(
-        "\n  summed distance {:.4}, least possible {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        "\n  summed distance {:.4}, minimum {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
         response.cost,
         response.exact_cost.map_or_else(|| "not computed".into(), |cost| format!("{cost:.4}")),
         response.gap.map_or_else(|| "unknown".into(), |gap| format!("{:.2} %", 100.0 * gap)),

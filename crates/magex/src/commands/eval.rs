@@ -1,10 +1,10 @@
 //! `magex eval`
 
 use crate::artifacts;
-use crate::cli::Global;
 use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
 use crate::failure::usage;
 use crate::folder;
+use crate::options::CommonOptions;
 use crate::output::{Table, note, seconds};
 use crate::settings;
 use magex_core::ids::Mode;
@@ -19,21 +19,22 @@ use std::time::Instant;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex eval runs/simple-spread-50-magex-s1                        100 episodes, greedy and sampled
-  magex eval RUN --seeds 1,2,3 --mode greedy                       300 episodes
-  magex eval RUN --agents 200 --scheduler exact                    a larger team, without training
-  magex eval RUN --controller scripted                             the yardstick
-  magex eval RUN --spawn lines --per-layout                        one row per layout
-  magex eval weights.safetensors --config config.toml --json       weights from elsewhere
+  magex eval runs/simple-spread-50-magex-s1        100 episodes per mode
+  magex eval RUN --episode-seeds 1,2,3 --mode greedy    300 episodes
+  magex eval RUN --agents 200 --scheduler exact    a larger team
+  magex eval RUN --controller scripted             the scripted baseline
+  magex eval RUN --spawn lines --per-layout        one row per layout
+  magex eval weights.safetensors --config config.toml   a weights file
 
-success: share of landmarks with an agent within 0.15 at the end. matched: the same, one agent per
-landmark. all covered: share of episodes with every landmark covered. arrival: first step with 99 %
-covered. collisions: other agents in contact, per agent and step. cost: summed distance of the goals over
-the least possible.
+success: share of landmarks with an agent within 0.15 at the end. matched: the
+same with one agent per landmark. all covered: share of episodes with every
+landmark covered. arrival: first step with 99 % covered. collisions: other
+agents in contact, per agent and step. cost: summed distance to the goals over
+the minimum.
 
-Exit codes: 0 done, 1 evaluation failed, 64 wrong usage or configuration";
+Exit codes: 0 success, 1 evaluation failed, 64 wrong usage or configuration";
 
-/// Measure a run on starts that training never saw.
+/// Evaluate a run on starts that training never saw.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct EvalArgs {
@@ -46,16 +47,19 @@ pub(crate) struct EvalArgs {
     /// Episodes per row.
     #[arg(long, value_name = "K", default_value_t = 100, value_parser = settings::count)]
     pub(crate) episodes: u32,
-    /// Seeds of the episodes, one row (per mode) each [default: the run's].
+    /// Seeds of the episodes, one row per seed and mode [default: the seed of the run].
     #[arg(long, value_name = "S,…", value_delimiter = ',')]
-    pub(crate) seeds: Vec<u64>,
+    pub(crate) episode_seeds: Vec<u64>,
+    /// The former name of --episode-seeds.
+    #[arg(long, value_name = "S,…", hide = true, value_parser = renamed)]
+    seeds: Option<String>,
     /// How actions and goals are chosen [default: both; greedy for the scripted controller].
     #[arg(long, value_enum, value_name = "MODE")]
     pub(crate) mode: Option<Modes>,
     /// One row per layout (spawn modes lines and authors).
     #[arg(long)]
     pub(crate) per_layout: bool,
-    /// Evaluation set: names the starts; 3 or more.
+    /// Evaluation set: selects the starts; 3 or more.
     #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = evaluate::eval_set)]
     pub(crate) eval_set: u32,
     /// Rollout threads [default: the cores of this machine].
@@ -68,6 +72,11 @@ pub(crate) struct EvalArgs {
     pub(crate) vary: Variation,
 }
 
+/// Rejects `--seeds`, which could be mistaken for the seeds of training runs.
+fn renamed(_: &str) -> Result<String, String> {
+    Err("this option is now called --episode-seeds".into())
+}
+
 /// One line of the table.
 struct Row {
     seed: u64,
@@ -77,8 +86,8 @@ struct Row {
     wall_s: f64,
 }
 
-pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
-    let output = global.output();
+pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8> {
+    let output = options.output();
     let trained = folder::load(&args.run, args.config.as_deref())?;
     trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
     let config = args.vary.apply(&trained)?;
@@ -87,7 +96,7 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
         Controller::Learned => Modes::Both,
         Controller::Scripted => Modes::Greedy,
     });
-    let seeds = if args.seeds.is_empty() { vec![config.run.seed] } else { args.seeds.clone() };
+    let seeds = if args.episode_seeds.is_empty() { vec![config.run.seed] } else { args.episode_seeds.clone() };
     let spawns = layouts(config.task.spawn, args.per_layout)?;
     let threads = args.threads.unwrap_or_else(settings::cores);
     let driver = match args.vary.controller {
@@ -108,12 +117,12 @@ pub(crate) fn run(args: &EvalArgs, global: &Global) -> anyhow::Result<u8> {
         for &seed in &seeds {
             let mut config = config.clone();
             (config.run.seed, config.task.spawn) = (seed, spawn);
-            let crew = args.vary.crew(&config, &trained.weights)?;
+            let policy = args.vary.policy(&config, &trained.weights)?;
             for &mode in modes.list() {
                 let clock = Instant::now();
                 let record = u32::from(args.record.is_some() && rows.is_empty());
                 let episodes = Episodes { count: args.episodes, set: args.eval_set, mode, record };
-                let (metrics, recordings) = roll_out(&crew, &config, episodes, threads)?;
+                let (metrics, recordings) = roll_out(&policy, &config, episodes, threads)?;
                 if let (Some(path), Some(recording)) = (&args.record, recordings.into_iter().next()) {
                     let subtitle = format!("{} · {} evaluation", artifacts::describe(&config), mode_name(mode));
                     let episode = [(recording, metrics.first().copied())];

@@ -1,6 +1,6 @@
 //! `magex health`
 
-use crate::cli::Global;
+use crate::options::CommonOptions;
 use magex_runtime::exit;
 use magex_runtime::health::probe;
 use serde_json::json;
@@ -8,33 +8,34 @@ use std::time::Duration;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex health http://127.0.0.1:7000                learner, over gRPC (grpc.health.v1)
-  magex health https://commander:7100 --timeout 5   with MAGEX_TLS_CA (and MAGEX_TLS_CERT, MAGEX_TLS_KEY)
-  magex health http://127.0.0.1:9102/healthz        a page, for actors: they serve no gRPC
+  magex health http://127.0.0.1:7000            gRPC (grpc.health.v1)
+  magex health http://127.0.0.1:9102/healthz    HTTP, for actors
+  magex health https://commander:7100 --timeout 5
 
-magex-learner, magex-commander and magex-actor ask themselves with --health-check: the options and the
-environment that they were started with say where.
+https uses MAGEX_TLS_CA, MAGEX_TLS_CERT and MAGEX_TLS_KEY. magex-learner,
+magex-commander and magex-actor check themselves with --health-check, at the
+address in their own options and environment.
 
-Exit codes: 0 it serves, 1 it does not, or not within the time, 64 wrong usage";
+Exit codes: 0 serving, 1 not serving or no answer in time, 64 wrong usage";
 
-/// Ask a service whether it is well: for orchestrators.
+/// Check the health of a service, for orchestrators.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct HealthArgs {
-    /// Who is asked.
+    /// Address of the service.
     #[arg(value_name = "URL")]
     url: String,
-    /// About which service, for example magex.v1.CommanderService; without it about the whole process.
+    /// gRPC service, for example magex.v1.CommanderService [default: the whole process].
     #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
     service: String,
-    /// Seconds for connection and answer.
+    /// Seconds for connection and response.
     #[arg(long, value_name = "SECONDS", default_value_t = probe::DEADLINE.as_secs() as u32, value_parser = clap::value_parser!(u32).range(1..=3600))]
     timeout: u32,
 }
 
-pub(crate) fn run(args: &HealthArgs, global: &Global) -> anyhow::Result<u8> {
+pub(crate) fn run(args: &HealthArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     probe::run(&args.url, &args.service, Duration::from_secs(args.timeout.into()))?;
-    let output = global.output();
+    let output = options.output();
     output.say(format!("{} serves", args.url));
     output.result(&json!({ "url": args.url, "serving": true }));
     Ok(exit::OK)

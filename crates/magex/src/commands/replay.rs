@@ -1,9 +1,9 @@
 //! `magex replay`
 
 use crate::artifacts::{describe, write_replay};
-use crate::cli::Global;
 use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
 use crate::folder;
+use crate::options::CommonOptions;
 use crate::settings;
 use magex_core::ids::Mode;
 use magex_runtime::exit;
@@ -12,16 +12,17 @@ use std::path::PathBuf;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex replay runs/simple-spread-50-magex-s1                      refreshes replay.html in the run folder
-  magex replay RUN --episodes 8 --spawn uniform --out wild.html    eight episodes from other starts
-  magex replay RUN --agents 200 --scheduler exact --out big.html   a larger team
-  magex replay RUN --controller scripted --out yardstick.html
+  magex replay runs/simple-spread-50-magex-s1        rewrites its replay.html
+  magex replay RUN --episodes 8 --spawn uniform --out wild.html
+  magex replay RUN --agents 200 --scheduler exact --out big.html
+  magex replay RUN --controller scripted --out baseline.html
 
-The page has everything inside: open it with a double click, or send it to somebody.
+The page is one self-contained file: open it in any browser.
 
-Exit codes: 0 done, 1 rollout failed, 64 wrong usage or configuration, 73 the file cannot be written";
+Exit codes: 0 success, 1 rollout failed, 64 wrong usage or configuration,
+73 the file cannot be written";
 
-/// Record evaluation episodes as a page to look at.
+/// Record evaluation episodes as an HTML page.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct ReplayArgs {
@@ -40,23 +41,23 @@ pub(crate) struct ReplayArgs {
     /// How actions and goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
     pub(crate) mode: Modes,
-    /// Evaluation set: names the starts; 3 or more.
+    /// Evaluation set: selects the starts; 3 or more.
     #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = evaluate::eval_set)]
     pub(crate) eval_set: u32,
     #[command(flatten)]
     pub(crate) vary: Variation,
 }
 
-pub(crate) fn run(args: &ReplayArgs, global: &Global) -> anyhow::Result<u8> {
-    let output = global.output();
+pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<u8> {
+    let output = options.output();
     let trained = folder::load(&args.run, args.config.as_deref())?;
     trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
     let config = args.vary.apply(&trained)?;
-    let crew = args.vary.crew(&config, &trained.weights)?;
+    let policy = args.vary.policy(&config, &trained.weights)?;
     let mut episodes = Vec::new();
     for &mode in args.mode.list() {
         let wanted = Episodes { count: args.episodes, set: args.eval_set, mode, record: args.episodes };
-        let (metrics, recordings) = roll_out(&crew, &config, wanted, settings::cores())?;
+        let (metrics, recordings) = roll_out(&policy, &config, wanted, settings::cores())?;
         episodes.extend(recordings.into_iter().zip(metrics.into_iter().map(Some)));
     }
     let modes: Vec<&str> = args.mode.list().iter().map(|&mode: &Mode| mode_name(mode)).collect();

@@ -1,22 +1,22 @@
-//! `magex train`
+//! `magex train`: read the configuration, prepare the run folder, run, report.
 
-use crate::artifacts::{write_curve, write_recorded_replay};
-use crate::cli::Global;
+use crate::artifacts::{run_name, write_curve, write_recorded_replay};
 use crate::failure::{coded, usage};
 use crate::folder;
 use crate::local::{EventChannel, LocalCollector};
+use crate::options::CommonOptions;
 use crate::output::{Output, note, program, seconds, thousands};
 use crate::progress::Progress;
 use crate::settings::{self, Overrides};
-use crate::supervise::{self, Crew};
+use crate::supervise::{self, ActorPlan, ServicesPlan, TrainEnd};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
-use magex_learner::page::{LivePage, RunInfo};
 use magex_learner::report::metrics_file::Summary;
 use magex_learner::trainer::{TrainError, TrainOutcome, Trainer};
 use magex_runtime::{backoff, exit, http, server, shutdown};
+use magex_viewer::page::{LivePage, RunInfo};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,122 +27,86 @@ use tokio_util::sync::CancellationToken;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex train                                   the default run: 50 agents, MAGE-X, two actors
-  magex train --executor local --seed 2         the small network, another seed
-  magex train my.toml --out runs/mine           a configuration of your own
-  magex train --resume --out runs/mine          continue after Ctrl-C or a crash
-  magex train --in-process --json               no other processes; result as JSON
-  magex train --http 127.0.0.1:8080             the live page on a port of your choice (off: no page)
+  magex train                              the default run: 50 agents, two actors
+  magex train --executor local --seed 2    the small network, another seed
+  magex train my.toml --out runs/mine      a configuration of your own
+  magex train --resume --out runs/mine     continue after Ctrl-C or a crash
+  magex train --in-process --json          one process; result as JSON
+  magex train --http 127.0.0.1:8080        fixed port for the live page
 
-The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, curve.svg,
-replay.html and tensorboard/. While the run goes, its live page says how it stands: the address is printed. The same configuration and seed give the same weights, in one process or with any number
-of actors. Ctrl-C finishes the iteration, writes a checkpoint and says how to resume; a second Ctrl-C
-stops at once.
+The run folder gets config.toml, metrics.jsonl, checkpoints/,
+weights.safetensors, summary.json, curve.svg, replay.html and tensorboard/.
+The address of the live page is printed at the start. The same configuration
+and seed give the same weights, in one process or with any number of actors.
+The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to
+resume; a second Ctrl-C stops at once.
 
-Exit codes: 0 done, 1 training failed, 64 wrong usage or configuration, 73 --out exists or cannot be
-written, 75 stopped before the end (--resume continues), 130 interrupted twice";
+Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
+73 --out exists or cannot be written, 75 stopped before the end (--resume
+continues), 130 interrupted twice";
 
-/// Train a team, and leave a run folder.
+/// Train a team and write a run folder.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct TrainArgs {
     /// Configuration file (TOML); missing keys take their defaults.
     #[arg(value_name = "CONFIG.toml")]
-    pub(crate) config: Option<PathBuf>,
+    config: Option<PathBuf>,
     /// Run folder [default: runs/<task>-<N>-<executor>-s<seed>, with -2, -3, … if it exists].
     #[arg(long, short, value_name = "DIR")]
-    pub(crate) out: Option<PathBuf>,
+    out: Option<PathBuf>,
     /// Continue the run in --out from its newest usable checkpoint.
     #[arg(long, requires = "out")]
-    pub(crate) resume: bool,
+    resume: bool,
     /// Actor processes.
     #[arg(long, value_name = "N", default_value = "2", value_parser = settings::actors)]
-    pub(crate) actors: usize,
-    /// Everything in this process: no services, no network; the same weights.
+    actors: usize,
+    /// Run everything in this process, without services and network; the weights are the same.
     #[arg(long)]
-    pub(crate) in_process: bool,
+    in_process: bool,
     /// Training threads (and rollout threads with --in-process) [default: the cores of this machine].
     #[arg(long, value_name = "T", value_parser = settings::threads)]
-    pub(crate) threads: Option<usize>,
-    /// Address of the live page, or `off`; port 0 is any free one.
+    threads: Option<usize>,
+    /// Address of the live page, or `off`; port 0 picks a free port.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:0")]
-    pub(crate) http: String,
-    /// Print the effective configuration as TOML and do nothing else.
+    http: String,
+    /// Print the effective configuration as TOML and exit.
     #[arg(long)]
-    pub(crate) print_config: bool,
+    print_config: bool,
     #[command(flatten)]
-    pub(crate) overrides: Overrides,
+    overrides: Overrides,
 }
 
-/// A run that is about to begin or to continue.
-pub(crate) struct Job {
-    pub(crate) config: RunConfig,
-    pub(crate) folder: PathBuf,
-    pub(crate) resume: bool,
-    pub(crate) threads: usize,
-    /// Where the live page is to be, if it is wanted.
-    pub(crate) http: Option<String>,
-}
+/// Reads the configuration, prepares the run folder, trains, and reports the result.
+pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u8> {
+    let (started, output) = (Instant::now(), options.output());
 
-/// How it ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum End {
-    /// Target reached or budget spent; summary.json is there.
-    Finished,
-    /// Told to stop; the run resumes.
-    Stopped,
-}
-
-pub(crate) fn run(args: &TrainArgs, global: &Global) -> anyhow::Result<u8> {
-    let clock = Instant::now();
-    let output = global.output();
-    let config = effective(args)?;
+    let config = read(args)?;
     if args.print_config {
         output.say(config.to_toml()?.trim_end());
         output.result(&serde_json::to_value(&config)?);
         return Ok(exit::OK);
     }
-    let http = (args.http != "off").then(|| args.http.clone());
-    if let Some(listen) = &http {
-        server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
-    }
-    let folder = args.out.clone().unwrap_or_else(|| folder::default_out(&config, Path::exists));
-    if !args.resume {
-        folder::create(&folder, &config)?;
-    }
-    let threads = args.threads.unwrap_or_else(settings::cores);
-    let job = Job { config, folder, resume: args.resume, threads, http };
-    let out = job.folder.display().to_string();
-    let title = match args.in_process {
-        true => format!("one process, {threads} threads"),
-        false => format!("learner, commander and {} actors on this machine", args.actors),
-    };
-    let crew = Crew { actors: args.actors, threads: (settings::cores() / args.actors).max(1) };
-    let mut progress = Progress::start(&job.config, &title, &out);
-    let end = match args.in_process {
-        true => in_process(&job, &mut progress),
-        false => supervise::run(&job, crew, &mut progress),
-    };
+
+    let plan = prepare(args, config)?;
+    let mut progress = Progress::start(&plan.config, &plan.title, &plan.folder.display().to_string());
+    let end = train(&plan, &mut progress);
     progress.end();
     let end = end?;
-    if let Err(error) = write_curve(&job.folder, &job.config) {
+
+    if let Err(error) = write_curve(&plan.folder, &plan.config) {
         tracing::warn!("no curve.svg: {error:#}");
     }
     match end {
-        End::Finished => {
-            if let Err(error) = write_recorded_replay(&job.folder, &job.config) {
-                tracing::warn!("no replay.html: {error:#}");
-            }
-            let span = |end: Instant| (end - clock).as_secs_f64();
-            let walls = Walls { command_s: span(Instant::now()), training_s: progress.last_iteration().map(span) };
-            finished(&job, args.in_process, walls, progress.page_url(), output)
-        }
-        End::Stopped => Ok(stopped(&job, output)),
+        TrainEnd::Finished => report_finished(&plan, started, &progress, output),
+        TrainEnd::Stopped => Ok(report_stopped(&plan, output)),
     }
 }
 
-/// Defaults < file < options; a resumed run keeps the configuration that it began with.
-fn effective(args: &TrainArgs) -> anyhow::Result<RunConfig> {
+// --- Read -------------------------------------------------------------------------------------------------------------
+
+/// Defaults < file < options. A resumed run keeps the configuration that it began with.
+fn read(args: &TrainArgs) -> anyhow::Result<RunConfig> {
     let Some(folder) = args.out.as_deref().filter(|_| args.resume) else {
         return Ok(args.overrides.apply(settings::read(args.config.as_deref())?)?);
     };
@@ -150,13 +114,12 @@ fn effective(args: &TrainArgs) -> anyhow::Result<RunConfig> {
         return Err(usage(format!("--out {} does not exist: leave out --resume to start a new run", folder.display())));
     }
     let own = folder::config_of(folder)?;
-    let asked = match &args.config {
+    let requested = match &args.config {
         Some(path) => args.overrides.apply(settings::read(Some(path))?)?,
         None => args.overrides.apply(own.clone())?,
     };
-    if asked != own {
-        let (asked, own) = (serde_json::to_value(&asked)?, serde_json::to_value(&own)?);
-        let differences = differences("", &own, &asked).join(", ");
+    if requested != own {
+        let differences = differences("", &serde_json::to_value(&own)?, &serde_json::to_value(&requested)?).join(", ");
         return Err(usage(format!(
             "--resume continues a run with the configuration that it began with ({}/config.toml), but {differences}; \
              leave these out, or start a new run with another --out",
@@ -167,87 +130,80 @@ fn effective(args: &TrainArgs) -> anyhow::Result<RunConfig> {
 }
 
 /// `run.seed is 1 there and 2 here`
-fn differences(path: &str, own: &Value, asked: &Value) -> Vec<String> {
-    match (own, asked) {
-        (Value::Object(own), Value::Object(asked)) => own
+fn differences(path: &str, own: &Value, requested: &Value) -> Vec<String> {
+    match (own, requested) {
+        (Value::Object(own), Value::Object(requested)) => own
             .iter()
             .flat_map(|(key, value)| {
                 let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-                differences(&path, value, asked.get(key).unwrap_or(&Value::Null))
+                differences(&path, value, requested.get(key).unwrap_or(&Value::Null))
             })
             .collect(),
-        _ if own == asked => Vec::new(),
-        _ => vec![format!("{path} is {own} there and {asked} here")],
+        _ if own == requested => Vec::new(),
+        _ => vec![format!("{path} is {own} there and {requested} here")],
     }
 }
 
-/// Learner, commander and rollouts as threads of this process.
-fn in_process(job: &Job, progress: &mut Progress) -> anyhow::Result<End> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let token = runtime.block_on(async { shutdown::on_signal() })?;
-    let flag = stop.clone();
-    runtime.spawn(async move {
-        token.cancelled().await;
-        flag.store(true, Ordering::Relaxed);
-        note("finishing the iteration, then writing a checkpoint");
-    });
-    let showing = match &job.http {
-        Some(listen) => {
-            Some(runtime.block_on(http::bind(listen)).map_err(|e| coded(exit::UNAVAILABLE, e.to_string()))?)
-        }
-        None => None,
+// --- Prepare ----------------------------------------------------------------------------------------------------------
+
+/// A run that is ready to start.
+struct Plan {
+    config: RunConfig,
+    folder: PathBuf,
+    resume: bool,
+    threads: usize,
+    /// Address of the live page, if there is one.
+    http: Option<String>,
+    /// The actor processes; `None` to train in this process.
+    actors: Option<ActorPlan>,
+    /// How it is trained, for display.
+    title: String,
+}
+
+/// Checks the options and creates the folder of a new run.
+fn prepare(args: &TrainArgs, config: RunConfig) -> anyhow::Result<Plan> {
+    let http = (args.http != "off").then(|| args.http.clone());
+    if let Some(listen) = &http {
+        server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
+    }
+    let folder = args.out.clone().unwrap_or_else(|| folder::default_out(&config, Path::exists));
+    if !args.resume {
+        folder::create(&folder, &config)?;
+    }
+    let threads = args.threads.unwrap_or_else(settings::cores);
+    let (actors, title) = if args.in_process {
+        (None, format!("one process, {threads} threads"))
+    } else {
+        let plan = ActorPlan { actors: args.actors, threads: (settings::cores() / args.actors).max(1) };
+        (Some(plan), format!("learner, commander and {} actors on this machine", args.actors))
     };
-    let name = job.folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-    let closing = CancellationToken::new();
-    let page = showing.map(|showing| {
-        progress.page(&showing.address().to_string());
-        let info = RunInfo { name, ..RunInfo::default() };
-        let page = Arc::new(LivePage::new(&job.config, info));
-        let _entered = runtime.enter();
-        (page.clone(), showing.serve(page.routes(|| None), closing.clone()))
-    });
-    let (shown, serving) = page.unzip();
-    let watched = shown.clone();
-    let (events, received) = mpsc::channel();
-    let mut collector = LocalCollector::new(&job.config, job.threads, stop);
-    let outcome = std::thread::scope(|scope| {
-        let training = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20).spawn_scoped(
-            scope,
-            move || {
-                let mut trainer = trainer(job)?;
-                trainer.observe(EventChannel(events));
-                if let Some(page) = shown {
-                    trainer.observe(page);
-                }
-                trainer.run(&mut collector)
-            },
-        )?;
-        received.iter().for_each(|event| progress.event(&event));
-        training.join().map_err(|_| coded(exit::INTERNAL, "the training thread panicked; its last words are above"))
-    })?;
-    if let Some(page) = watched.filter(|_| outcome.is_ok()) {
-        runtime.block_on(page.farewell());
-    }
-    closing.cancel();
-    if let Some(serving) = serving {
-        // It only logs what goes wrong, and ends soon.
-        let _ = runtime.block_on(serving);
-    }
-    match outcome? {
-        TrainOutcome::Finished(_) => Ok(End::Finished),
-        TrainOutcome::Stopped(_) => Ok(End::Stopped),
+    Ok(Plan { config, folder, resume: args.resume, threads, http, actors, title })
+}
+
+// --- Run --------------------------------------------------------------------------------------------------------------
+
+fn train(plan: &Plan, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
+    // With services too, the run is created or checked here: errors reach the terminal instead of a log file, and the
+    // learner process always continues from a checkpoint.
+    let trainer = open(plan)?;
+    match plan.actors {
+        None => train_in_process(plan, trainer, progress),
+        Some(actors) => {
+            drop(trainer);
+            let (folder, http) = (plan.folder.as_path(), plan.http.as_deref());
+            supervise::run(&ServicesPlan { folder, threads: plan.threads, http, actors }, progress)
+        }
     }
 }
 
-/// A new trainer, or one that continues; says what was wrong with newer checkpoints.
-pub(crate) fn trainer(job: &Job) -> Result<Trainer, TrainError> {
-    if !job.resume {
+/// Creates the run, or opens the newest usable checkpoint; logs what is wrong with newer ones.
+fn open(plan: &Plan) -> Result<Trainer, TrainError> {
+    if !plan.resume {
         let run_id = RunId(format!("{:016x}", backoff::random_id()));
-        return Trainer::create(&job.config, run_id, &job.folder, job.threads);
+        return Trainer::create(&plan.config, run_id, &plan.folder, plan.threads);
     }
-    let (trainer, skipped) = Trainer::resume(&job.config, &job.folder, job.threads)?;
-    let from = folder::continues_from(&job.folder, skipped.len()).unwrap_or_default();
+    let (trainer, skipped) = Trainer::resume(&plan.config, &plan.folder, plan.threads)?;
+    let from = folder::continues_from(&plan.folder, skipped.len()).unwrap_or_default();
     for error in &skipped {
         tracing::warn!("{}; continuing from {from}", folder::what_is_wrong(error));
     }
@@ -257,61 +213,105 @@ pub(crate) fn trainer(job: &Job) -> Result<Trainer, TrainError> {
     Ok(trainer)
 }
 
-/// Seconds since the command began.
-struct Walls {
-    /// Until its end.
-    command_s: f64,
-    /// Until the last iteration was reported, so until the target was reached if it was.
-    training_s: Option<f64>,
+/// Learner, commander and rollouts as threads of this process.
+fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let (signal, flag) = (runtime.block_on(async { shutdown::on_signal() })?, stop.clone());
+    runtime.spawn(async move {
+        signal.cancelled().await;
+        flag.store(true, Ordering::Relaxed);
+        note("finishing the iteration, then writing a checkpoint");
+    });
+
+    let closing = CancellationToken::new();
+    let mut page = None;
+    if let Some(listen) = &plan.http {
+        let listener = runtime.block_on(http::bind(listen)).map_err(|e| coded(exit::UNAVAILABLE, e.to_string()))?;
+        progress.page(&listener.address().to_string());
+        let live =
+            Arc::new(LivePage::new(&plan.config, RunInfo { name: run_name(&plan.folder), ..RunInfo::default() }));
+        trainer.observe(live.clone());
+        let _entered = runtime.enter();
+        page = Some((live.clone(), listener.serve(live.routes(|| None), closing.clone())));
+    }
+
+    let (events, received) = mpsc::channel();
+    trainer.observe(EventChannel(events));
+    let mut collector = LocalCollector::new(&plan.config, plan.threads, stop);
+    let outcome = std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);
+        let training = thread.spawn_scoped(scope, move || trainer.run(&mut collector))?;
+        received.iter().for_each(|event| progress.event(&event));
+        training.join().map_err(|_| coded(exit::INTERNAL, "the training thread panicked; its message is above"))
+    })?;
+
+    if let Some((live, serving)) = page {
+        if outcome.is_ok() {
+            runtime.block_on(live.farewell());
+        }
+        closing.cancel();
+        // The server logs its own errors and ends soon.
+        let _ = runtime.block_on(serving);
+    }
+    match outcome? {
+        TrainOutcome::Finished(_) => Ok(TrainEnd::Finished),
+        TrainOutcome::Stopped(_) => Ok(TrainEnd::Stopped),
+    }
 }
 
-fn finished(job: &Job, in_process: bool, walls: Walls, page: Option<&str>, output: Output) -> anyhow::Result<u8> {
-    let path = job.folder.join(folder::SUMMARY);
-    let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-    let mut value: Value = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
-    let s: Summary = serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?;
-    let why = if s.target_reached { "target reached" } else { "budget spent" };
+// --- Report -----------------------------------------------------------------------------------------------------------
+
+fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: Output) -> anyhow::Result<u8> {
+    if let Err(error) = write_recorded_replay(&plan.folder, &plan.config) {
+        tracing::warn!("no replay.html: {error:#}");
+    }
+    let command_s = started.elapsed().as_secs_f64();
+    // Until the last iteration was reported: the one that reached the target, if it was reached.
+    let training_s = progress.last_iteration().map(|end| (end - started).as_secs_f64());
+    let path = plan.folder.join(folder::SUMMARY);
+    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    let mut value: Value = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+    let s: Summary = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+
     let sampled = METRICS[SUCCESS_RATE].write(s.episodes.sampled_success_rate.unwrap_or_default());
-    let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&job.config.task));
+    let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&plan.config.task));
     let mut rows: Vec<(&str, String)> = metrics
         .filter_map(|(metric, mean)| Some((metric.label, format!("{} {}", metric.write(mean?), metric.unit))))
         .collect();
     rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
     rows.extend([
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
-        (
-            "wall time",
-            format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(walls.command_s)),
-        ),
+        ("wall time", format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(command_s))),
         ("weights sha256", s.weights_sha256),
     ]);
-    let out = job.folder.display();
-    let episodes = s.final_episodes;
-    output.say(format!("\nDone: {why}. On {episodes} episodes with starts that training never saw:\n"));
+    let why = if s.target_reached { "target reached" } else { "budget spent" };
+    output.say(format!("\nDone: {why}. Evaluated on {} episodes with unseen starts:\n", s.final_episodes));
     for (name, value) in rows {
         output.say(format!("  {name:<16} {value}"));
     }
-    let magex = program();
+    let (magex, out) = (program(), plan.folder.display());
     output.say(format!("\nNext:\n  {magex} eval {out}"));
-    if !job.config.executor.kind.fixed_team_size() {
-        output.say(format!("  {magex} eval {out} --agents {} --scheduler exact", 4 * job.config.task.agents));
+    if !plan.config.executor.kind.fixed_team_size() {
+        output.say(format!("  {magex} eval {out} --agents {} --scheduler exact", 4 * plan.config.task.agents));
     }
     output.say(format!("  open {out}/replay.html and {out}/curve.svg"));
+
     if let Value::Object(map) = &mut value {
-        map.insert("command_wall_s".into(), json!(walls.command_s));
-        map.insert("target_wall_s".into(), json!(walls.training_s));
-        map.insert("out".into(), json!(job.folder));
-        map.insert("in_process".into(), json!(in_process));
-        map.insert("page".into(), json!(page));
+        map.insert("command_wall_s".into(), json!(command_s));
+        map.insert("target_wall_s".into(), json!(training_s));
+        map.insert("out".into(), json!(plan.folder));
+        map.insert("in_process".into(), json!(plan.actors.is_none()));
+        map.insert("page".into(), json!(progress.page_url()));
     }
     output.result(&value);
     Ok(exit::OK)
 }
 
-fn stopped(job: &Job, output: Output) -> u8 {
-    let command = format!("{} train --resume --out {}", program(), job.folder.display());
+fn report_stopped(plan: &Plan, output: Output) -> u8 {
+    let command = format!("{} train --resume --out {}", program(), plan.folder.display());
     output.say(format!("\nStopped before the end. Continue with\n  {command}"));
-    output.result(&json!({ "stopped": true, "out": job.folder, "resume": command, "exit_code": exit::TEMPORARY }));
+    output.result(&json!({ "stopped": true, "out": plan.folder, "resume": command, "exit_code": exit::TEMPORARY }));
     exit::TEMPORARY
 }
 
@@ -324,8 +324,8 @@ mod tests {
         let own = serde_json::to_value(RunConfig::default()).unwrap();
         let mut other = RunConfig::default();
         (other.run.seed, other.mappo.gamma) = (2, 0.5);
-        let asked = serde_json::to_value(&other).unwrap();
-        let words = differences("", &own, &asked);
+        let requested = serde_json::to_value(&other).unwrap();
+        let words = differences("", &own, &requested);
         assert_eq!(words.len(), 2);
         assert!(words.contains(&"run.seed is 1 there and 2 here".to_owned()), "{words:?}");
         assert!(differences("", &own, &own).is_empty());

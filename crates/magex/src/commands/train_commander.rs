@@ -1,11 +1,13 @@
-//! `magex train-commander`: the learned goal scheduler alone, on synthetic instances.
+//! `magex train-commander`: trains the learned goal scheduler alone, on synthetic instances.
 //!
-//! First it imitates the exact solver, then PPO goes on from there on the paper's reward R_c = 1 − C_c / C_h.
+//! Imitation of the exact solver comes first, then PPO with the paper's reward R_c = 1 − C_c / C_h.
 
-use crate::cli::Global;
+use crate::artifacts;
 use crate::failure::usage;
 use crate::folder;
+use crate::options::CommonOptions;
 use crate::output::{Output, Table, note, program, seconds};
+use crate::parallel;
 use crate::settings;
 use crate::synthetic::Synthetic;
 use anyhow::Context as _;
@@ -26,21 +28,23 @@ use std::time::Instant;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex train-commander --out runs/scheduler              imitation, then PPO: about a minute
-  magex train-commander my.toml --ppo 0 --seed 2          the [commander] section of my.toml, imitation only
-  magex commander --weights runs/scheduler                serves it
-  magex bench commander --run runs/scheduler              measures it on other instances
+  magex train-commander --out runs/scheduler        about a minute
+  magex train-commander my.toml --ppo 0 --seed 2    imitation only
+  magex commander --weights runs/scheduler          serves it
 
-The folder gets config.toml, metrics.jsonl, weights.safetensors (the commander alone: magex eval needs a run of
-magex train) and summary.json. The same options and seed give the same weights with any number of threads.
+The folder gets config.toml, metrics.jsonl, summary.json and
+weights.safetensors, which contains the commander alone: magex eval needs a run
+of magex train. The same options and seed give the same weights with any number
+of threads.
 
-Exit codes: 0 done, 1 training failed, 64 wrong usage or configuration, 73 --out exists or cannot be written";
+Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
+73 --out exists or cannot be written";
 
 /// Train the goal scheduler alone, on synthetic teams of 2 to 200 agents.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct TrainCommanderArgs {
-    /// Configuration file (TOML); its [commander] section and run.seed count.
+    /// Configuration file (TOML); only its [commander] section and run.seed are used.
     #[arg(value_name = "CONFIG.toml")]
     config: Option<PathBuf>,
     /// Folder of the result [default: runs/commander-s<seed>, with -2, -3, … if it exists].
@@ -63,7 +67,7 @@ pub(crate) struct TrainCommanderArgs {
     threads: Option<usize>,
 }
 
-/// Sets of instances; `bench` uses other ones.
+/// Sets of instances; the benchmarks use other ones.
 const IMITATION: u32 = 3;
 const REWARD: u32 = 4;
 const VALIDATION: u32 = 5;
@@ -75,18 +79,19 @@ const VALIDATION_INSTANCES: u32 = 32;
 /// Lines of metrics.jsonl.
 const MEASUREMENTS: u32 = 20;
 
-pub(crate) fn run(args: &TrainCommanderArgs, global: &Global) -> anyhow::Result<u8> {
+pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let mut config = settings::read(args.config.as_deref())?;
     config.run.seed = args.seed.unwrap_or(config.run.seed);
     let config = config.validated()?;
     if config.commander.kind != CommanderPolicy::Pairwise {
         let kind = config.commander.kind;
-        return Err(usage(format!("commander.kind: {kind} does not serve teams of every size; use pairwise")));
+        return Err(usage(format!("commander.kind: {kind} has a fixed team size; use pairwise")));
     }
     if args.imitation + args.ppo == 0 {
-        return Err(usage("--imitation and --ppo: 0 steps teach nothing; give one of them"));
+        return Err(usage("--imitation and --ppo: both are 0; at least one must be positive"));
     }
-    let out = args.out.clone().unwrap_or_else(|| default_out(config.run.seed));
+    let name = format!("commander-s{}", config.run.seed);
+    let out = args.out.clone().unwrap_or_else(|| folder::unused(&name, Path::exists));
     folder::create(&out, &config)?;
     let training = Training {
         ppo: CommanderPpo::new(&config.commander, &config.task, config.run.seed),
@@ -95,14 +100,7 @@ pub(crate) fn run(args: &TrainCommanderArgs, global: &Global) -> anyhow::Result<
         config,
         out,
     };
-    training.run(global.output())
-}
-
-fn default_out(seed: u64) -> PathBuf {
-    let name = |k: u32| {
-        Path::new("runs").join(if k == 1 { format!("commander-s{seed}") } else { format!("commander-s{seed}-{k}") })
-    };
-    (1..).map(name).find(|path| !path.exists()).unwrap_or_else(|| name(1))
+    training.run(options.output())
 }
 
 struct Training {
@@ -148,9 +146,9 @@ impl Training {
             "cost_ratio": named(&measured), "untrained_cost_ratio": named(&untrained),
             "wall_s": clock.elapsed().as_secs_f64(),
         });
-        self.write(folder::WEIGHTS, &weights)?;
-        self.write(folder::SUMMARY, &serde_json::to_vec(&summary)?)?;
-        self.tell(output, &untrained, &measured, summary);
+        artifacts::write(&self.out.join(folder::WEIGHTS), &weights)?;
+        artifacts::write(&self.out.join(folder::SUMMARY), &serde_json::to_vec(&summary)?)?;
+        self.report(output, &untrained, &measured, summary);
         Ok(exit::OK)
     }
 
@@ -206,15 +204,7 @@ impl Training {
         Ok(means)
     }
 
-    /// Whole files only.
-    fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
-        let temporary = self.out.join(format!(".{name}.tmp"));
-        let path = self.out.join(name);
-        let written = std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, &path));
-        written.with_context(|| path.display().to_string())
-    }
-
-    fn tell(&self, output: Output, untrained: &[f64], measured: &[f64], mut summary: Value) {
+    fn report(&self, output: Output, untrained: &[f64], measured: &[f64], mut summary: Value) {
         let mut table = Table::new(1, &["N", "untrained", "trained"]);
         for ((n, before), after) in VALIDATION_SIZES.iter().zip(untrained).zip(measured) {
             table.row(vec![n.to_string(), format!("{before:.5}"), format!("{after:.5}")]);
@@ -224,10 +214,7 @@ impl Training {
         output.say(format!(
             "\nDone in {wall}. Cost over the exact cost on {VALIDATION_INSTANCES} unseen instances each:\n\n{table}\n"
         ));
-        output.say(format!(
-            "Next:\n  {magex} bench commander --run {out}\n  {magex} commander --weights {out}",
-            magex = program()
-        ));
+        output.say(format!("Next:\n  {} commander --weights {out}", program()));
         summary["out"] = json!(self.out);
         output.result(&summary);
     }
@@ -247,39 +234,18 @@ fn list(ratios: &[f64]) -> String {
     VALIDATION_SIZES.iter().zip(ratios).map(one).collect::<Vec<_>>().join(", ")
 }
 
-/// `work` of 0..count on several threads; the results are in order, so their number does not matter.
+/// [`parallel::in_order`] for work that can fail.
 fn in_parallel<T: Send>(
     threads: usize,
     count: u32,
     work: impl Fn(u32) -> anyhow::Result<T> + Sync,
 ) -> anyhow::Result<Vec<T>> {
-    let threads = threads.clamp(1, count.max(1) as usize) as u32;
-    let parts: Vec<anyhow::Result<Vec<T>>> = std::thread::scope(|scope| {
-        let part = |from: u32| -> Vec<u32> { (from * count / threads..(from + 1) * count / threads).collect() };
-        let spawn =
-            |indices: Vec<u32>| scope.spawn(|| indices.into_iter().map(&work).collect::<anyhow::Result<Vec<T>>>());
-        let handles: Vec<_> = (0..threads).map(part).map(spawn).collect();
-        let failed = |_| Err(anyhow::anyhow!("a thread panicked; its last words are above"));
-        handles.into_iter().map(|handle| handle.join().unwrap_or_else(failed)).collect()
-    });
-    let mut all = Vec::with_capacity(count as usize);
-    for part in parts {
-        all.extend(part?);
-    }
-    Ok(all)
+    parallel::in_order(threads, count as usize, |k| work(k as u32))?.into_iter().collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_order_of_results_does_not_depend_on_the_threads() {
-        for threads in [1, 2, 3, 64] {
-            assert_eq!(in_parallel(threads, 7, |k| Ok(k * k)).unwrap(), [0, 1, 4, 9, 16, 25, 36]);
-        }
-        assert!(in_parallel(2, 7, |k| if k == 6 { anyhow::bail!("six") } else { Ok(k) }).is_err());
-    }
 
     #[test]
     fn a_short_training_leaves_a_folder_that_loads_and_the_same_weights_with_any_number_of_threads() {

@@ -1,27 +1,30 @@
 //! `magex verify`
 
-use crate::cli::Global;
 use crate::failure::usage;
-use crate::verify::{FileReport, Outcome, verify_dir};
+use crate::options::CommonOptions;
 use magex_runtime::exit;
+use magex_verify::{Check, FileReport, Outcome, verify_dir};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
 const AFTER_HELP: &str = "\
 Examples:
-  magex verify crates/env/testdata           every recording below the folder
-  magex verify recordings/mpe-n50.json       one file
+  magex verify crates/verify/testdata     every recording below the folder
+  magex verify recordings/mpe-n50.json    one file
   magex verify DIR --json
 
-Recordings of the original particle simulator (mpe-golden-1: Simple Spread and Push Ball) and of the original
-drone simulator (drone-golden-1) are replayed step by step, the drones by the exact model and by the task's
-rigid-body engine; calls of its controller (drone-controller-golden-1) and its forces (drone-forces-golden-1)
-are recomputed; assignment problems (assignment-golden-1) are solved. The worst difference per file is printed
-beside the largest one that passes, or beside the reason why there is none. Other JSON files are skipped.
+Recordings of the original particle simulator (mpe-golden-1: Simple Spread and
+Push Ball) and of the original drone simulator (drone-golden-1) are replayed
+step by step, the drones by the exact model and by the task's rigid-body
+engine. Calls of its controller (drone-controller-golden-1) and its forces
+(drone-forces-golden-1) are recomputed. Assignment problems
+(assignment-golden-1) are solved. Each file is listed with its worst difference
+and the largest difference that passes. Other JSON files are skipped.
 
-Exit codes: 0 everything agrees, 1 something does not or nothing could be checked, 64 no such folder";
+Exit codes: 0 everything agrees, 1 a recording disagrees or nothing could be
+checked, 64 no such folder";
 
-/// Check simulators, controller and solver against recordings.
+/// Check simulators, controller and solver against recordings of other programs.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct VerifyArgs {
@@ -30,9 +33,9 @@ pub(crate) struct VerifyArgs {
     pub(crate) dir: PathBuf,
 }
 
-pub(crate) fn run(args: &VerifyArgs, global: &Global) -> anyhow::Result<u8> {
+pub(crate) fn run(args: &VerifyArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let report = verify_dir(&args.dir).map_err(usage)?;
-    let output = global.output();
+    let output = options.output();
     output.say(report.to_string().trim_end());
     output.result(&json!({
         "passed": report.passed(),
@@ -50,17 +53,13 @@ fn value(file: &FileReport) -> Value {
         Outcome::Fails(reasons) => ("fails", reasons.clone()),
         Outcome::Skipped(reason) => ("skipped", vec![reason.clone()]),
     };
-    // What is for information has no limit, but words.
-    let checks = file.checks.iter().map(|c| {
-        let limit = c.limit.is_finite().then_some(c.limit);
-        json!({ "what": c.what, "worst": c.worst, "limit": limit, "words": c.words })
-    });
+    let check = |c: &Check| json!({ "what": c.what, "worst": c.worst, "limit": c.limit, "words": c.words });
     json!({
         "path": file.path,
         "format": file.format,
         "content": file.content,
         "outcome": outcome,
         "reasons": reasons,
-        "checks": checks.collect::<Vec<_>>(),
+        "checks": file.checks.iter().map(check).collect::<Vec<_>>(),
     })
 }

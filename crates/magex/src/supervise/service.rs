@@ -1,7 +1,7 @@
-//! One service as a child process: started, watched, started again, stopped.
+//! One service as a child process: start, watch, restart, stop.
 
-use crate::commands::roles::LEASH;
 use crate::failure::coded;
+use crate::parent_watch;
 use anyhow::{Context as _, anyhow};
 use magex_runtime::backoff::Backoff;
 use magex_runtime::exit;
@@ -15,59 +15,63 @@ use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdin, Command};
 use tokio_util::sync::CancellationToken;
 
-/// A service says that it is ready within this time.
+/// A service must print its ready line within this time.
 const START: Duration = Duration::from_secs(30);
-/// A service that was told to stop is killed after this time.
+/// A service that does not stop within this time is killed.
 const GRACE: Duration = Duration::from_secs(10);
-/// A helper that dies this often, each time soon after it was started, is given up.
+/// A service that dies this often, each time within [`STABLE`] of its start, is not restarted again.
 const LIVES: u32 = 5;
-/// Not soon.
-const LONG: Duration = Duration::from_secs(20);
+/// A service that ran for this time gets all its lives back.
+const STABLE: Duration = Duration::from_secs(20);
 
 /// How to start a service.
 #[derive(Debug, Clone)]
-pub(crate) struct Service {
+pub struct Service {
     name: String,
     arguments: Vec<String>,
     log: PathBuf,
 }
 
-/// A service that runs.
+/// A running service.
 #[derive(Debug)]
-pub(crate) struct Running {
+pub struct Running {
     name: String,
     child: Child,
-    /// Open for as long as the service shall run. Held apart: waiting for a child closes what it still has.
+    /// The service stops when this closes. Kept outside of `child`, because waiting for a child closes its own stdin.
     _stdin: Option<ChildStdin>,
     log: PathBuf,
-    /// Where the log of this process begins.
+    /// Length of the log before this process wrote to it.
     log_start: u64,
-    /// Where it listens; empty if it does not.
-    pub(crate) address: String,
-    /// Where it shows its pages, if it does.
+    /// Address it listens on; empty if it does not listen.
+    pub address: String,
+    /// Address of its HTTP page, if it has one.
     pub(crate) http: Option<String>,
 }
 
 impl Service {
-    pub(crate) fn new(name: &str, arguments: &[&str], logs: &Path) -> anyhow::Result<Self> {
+    /// The command line `magex <arguments>`; standard error is appended to `<name>.log` in `logs`.
+    pub fn new(name: &str, arguments: &[&str], logs: &Path) -> Self {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        Ok(Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")) })
+        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")) }
     }
 
     /// Starts it and waits until it is ready.
-    pub(crate) async fn start(&self) -> anyhow::Result<Running> {
+    pub async fn start(&self) -> anyhow::Result<Running> {
         let open = || OpenOptions::new().create(true).append(true).open(&self.log);
         let log = open().with_context(|| self.log.display().to_string())?;
         let log_start = log.metadata().map_or(0, |meta| meta.len());
         let mut command = Command::new(std::env::current_exe()?);
-        // Only what is said here counts, not what the environment says to services that run alone.
+        // Options in the environment are meant for services that run alone.
         for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("MAGEX_")) {
             command.env_remove(name);
         }
         command
+            // An executable that embeds `magex` recognises the command line by this name.
+            .arg0("magex")
             .args(&self.arguments)
-            .arg(format!("--{LEASH}"))
-            // Its standard input ends when this process does. A terminal's Ctrl-C does not reach it: it has a group of its own.
+            .arg(format!("--{}", parent_watch::OPTION))
+            // Standard input ends when this process does. The service has a process group of its own, so that a terminal's
+            // Ctrl-C reaches only this process.
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(log)
@@ -91,50 +95,75 @@ impl Service {
             }
             Ok(None) => {
                 let status = running.wait().await?;
-                let code = status.code().and_then(|code| u8::try_from(code).ok()).filter(|&c| c != exit::OK);
-                let words = format!("the {} could not be started: {}", self.name, running.last_words(status));
-                Err(coded(code.unwrap_or(exit::FAILURE), words))
+                let code = code_of(status).filter(|&code| code != exit::OK);
+                let message = format!("the {} could not be started: {}", self.name, running.failure(status));
+                Err(coded(code.unwrap_or(exit::FAILURE), message))
             }
             Err(_) => Err(anyhow!("the {} was not ready within {} s", self.name, START.as_secs())),
         }
     }
 }
 
+impl Service {
+    /// Starts it again after a wait. A start that fails (killed again, the port still in use) costs one of the lives.
+    pub(crate) async fn restart(&self, lives: &mut u32, mut wait: impl FnMut() -> Duration) -> anyhow::Result<Running> {
+        loop {
+            tokio::time::sleep(wait()).await;
+            match self.start().await {
+                Err(error) if *lives > 1 => {
+                    *lives -= 1;
+                    tracing::warn!(service = self.name, %error, "the service could not be started; trying again");
+                }
+                started => return started,
+            }
+        }
+    }
+
+    /// The error after the last restart.
+    pub(crate) fn gave_up(&self, code: Option<u8>, reason: &str) -> anyhow::Error {
+        let message = format!("the {} failed: {reason} (log: {})", self.name, self.log.display());
+        coded(code.unwrap_or(exit::FAILURE), message)
+    }
+}
+
 impl Running {
-    /// Until it ends.
+    /// Waits until it ends.
     pub(crate) async fn wait(&mut self) -> std::io::Result<ExitStatus> {
         self.child.wait().await
     }
 
-    /// Its process; 0 once it has ended.
-    pub(crate) fn id(&self) -> u32 {
+    /// Its process id; 0 after it has ended.
+    pub fn id(&self) -> u32 {
         self.child.id().unwrap_or_default()
     }
 
-    /// SIGKILL.
-    pub(crate) async fn kill(&mut self) -> std::io::Result<()> {
+    /// Sends SIGKILL and waits until it has ended.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub async fn kill(&mut self) -> std::io::Result<()> {
         self.child.kill().await
     }
 
-    /// Asks it to stop.
+    /// Sends SIGTERM.
     pub(crate) fn terminate(&self) {
         if let Some(pid) = self.child.id().and_then(|id| Pid::from_raw(id as i32)) {
-            // It may be gone already.
+            // It may have ended already.
             let _ = kill_process(pid, Signal::TERM);
         }
     }
 
-    /// Asks it to stop, waits, and kills it if it does not.
-    pub(crate) async fn stop(&mut self) {
+    /// Sends SIGTERM, waits, and kills it if it does not stop in time.
+    pub async fn stop(&mut self) {
         self.terminate();
         if tokio::time::timeout(GRACE, self.wait()).await.is_err() {
-            tracing::warn!(service = self.name, "does not stop; killing it");
+            tracing::warn!(service = self.name, "the service does not stop; killing it");
             let _ = self.child.kill().await;
         }
     }
 
-    /// Why it ended: the signal, or the last line of its log.
-    pub(crate) fn last_words(&self, status: ExitStatus) -> String {
+    /// Why it ended: the signal, or the tail of its standard error.
+    pub(crate) fn failure(&self, status: ExitStatus) -> String {
         if let Some(signal) = status.signal() {
             return format!("killed by signal {signal}");
         }
@@ -146,7 +175,7 @@ impl Running {
     }
 }
 
-/// Keeps a helper running until `stop`, or until it has done its work.
+/// Keeps a service running until `stop`, or until its work is done.
 pub(crate) async fn keep(service: Service, first: Running, stop: CancellationToken) -> anyhow::Result<()> {
     let mut running = first;
     let (mut lives, mut backoff) = (LIVES, Backoff::default());
@@ -159,36 +188,28 @@ pub(crate) async fn keep(service: Service, first: Running, stop: CancellationTok
                 return Ok(());
             }
         };
-        // A helper ends well when the run does; without that it was told to stop from outside, and is needed.
-        if status.success() && tokio::time::timeout(std::time::Duration::from_secs(2), stop.cancelled()).await.is_ok() {
+        // A service succeeds when the run ends. If the run continues, something else stopped the service: restart it.
+        if status.success() && tokio::time::timeout(Duration::from_secs(2), stop.cancelled()).await.is_ok() {
             return Ok(());
         }
-        if started.elapsed() >= LONG {
+        if started.elapsed() >= STABLE {
             (lives, backoff) = (LIVES, Backoff::default());
         }
         lives -= 1;
-        let reason = running.last_words(status);
-        let code = status.code().and_then(|code| u8::try_from(code).ok());
+        let (code, reason) = (code_of(status), running.failure(status));
         if lives == 0 || code.is_some_and(|code| code == exit::USAGE || code == exit::UNAVAILABLE) {
-            let log = service.log.display();
-            return Err(coded(
-                code.unwrap_or(exit::FAILURE),
-                format!("the {} failed: {reason} (log: {log})", service.name),
-            ));
+            return Err(service.gave_up(code, &reason));
         }
-        tracing::warn!(service = service.name, reason, "died; starting it again");
-        running = loop {
-            if stop.run_until_cancelled(tokio::time::sleep(backoff.next_wait())).await.is_none() {
-                return Ok(());
-            }
-            match service.start().await {
-                Ok(running) => break running,
-                Err(error) if lives <= 1 => return Err(error),
-                Err(error) => {
-                    lives -= 1;
-                    tracing::warn!(service = service.name, %error, "could not be started; trying again");
-                }
-            }
-        };
+        tracing::warn!(service = service.name, reason, "the service died; restarting it");
+        let restart = service.restart(&mut lives, || backoff.next_wait());
+        match stop.run_until_cancelled(restart).await {
+            Some(restarted) => running = restarted?,
+            None => return Ok(()),
+        }
     }
+}
+
+/// The exit code, unless a signal killed the process.
+pub(crate) fn code_of(status: ExitStatus) -> Option<u8> {
+    status.code().and_then(|code| u8::try_from(code).ok())
 }

@@ -1,0 +1,214 @@
+//! The reference model and the controller against a recorded flight.
+
+use super::recording::{Mode, Physics, Trajectory};
+use super::{DroneReport, apart, turned};
+use crate::check::{Check, worse};
+use magex_env::drones::control::{Answer, Memory, Request};
+use magex_env::drones::model::{Inputs, State};
+
+/// Everything the model remembers of a flight.
+#[derive(Debug, Clone)]
+struct Flight {
+    states: Vec<State>,
+    lagged: Vec<[f64; 4]>,
+    rpm_before: Vec<[f64; 4]>,
+    rates: Vec<[f64; 3]>,
+}
+
+impl Flight {
+    /// The recorded state before step `t`.
+    fn at(recording: &Trajectory, t: usize) -> Self {
+        let drones = 0..recording.drones;
+        Self {
+            states: recording.frames[t].clone(),
+            lagged: drones.clone().map(|i| recording.lagged(t, i)).collect(),
+            rpm_before: drones.map(|i| recording.rpm_before(t, i)).collect(),
+            rates: recording.rates.get(t).cloned().unwrap_or_default(),
+        }
+    }
+
+    fn step(&mut self, recording: &Trajectory, rpm: &[[f64; 4]]) {
+        let before = self.states.clone();
+        for (i, &state) in before.iter().enumerate() {
+            self.states[i] = match recording.physics {
+                Physics::Bullet(effects) => {
+                    let wash = if effects.downwash { wash(recording, &before, i) } else { 0.0 };
+                    let inputs = Inputs { lagged: self.lagged[i], rpm: rpm[i], rpm_before: self.rpm_before[i], wash };
+                    recording.craft.step(&state, &inputs, effects, recording.dt)
+                }
+                Physics::Explicit => {
+                    let (next, rates) = recording.craft.step_explicit(&state, self.rates[i], rpm[i], recording.dt);
+                    self.rates[i] = rates;
+                    next
+                }
+            };
+            self.lagged[i] = state.attitude;
+            self.rpm_before[i] = rpm[i];
+        }
+    }
+
+    /// Largest difference from the recorded state before step `t`.
+    fn apart(&self, recording: &Trajectory, t: usize) -> f64 {
+        let mut worst = 0.0;
+        for (ours, recorded) in self.states.iter().zip(&recording.frames[t]) {
+            worst = worse(worst, difference(ours, recorded));
+        }
+        for (ours, recorded) in self.rates.iter().zip(recording.rates.get(t).into_iter().flatten()) {
+            worst = worse(worst, apart(ours, recorded));
+        }
+        worst
+    }
+}
+
+/// Largest difference of a coordinate over max(1, |recorded|).
+pub(super) fn difference(ours: &State, recorded: &State) -> f64 {
+    let mut worst = turned(ours.attitude, recorded.attitude);
+    worst = worse(worst, apart(&ours.position, &recorded.position));
+    worst = worse(worst, apart(&ours.velocity, &recorded.velocity));
+    worse(worst, apart(&ours.spin, &recorded.spin))
+}
+
+/// Sum of the downwash of all drones above drone `i`, in their order.
+pub(super) fn wash(recording: &Trajectory, states: &[State], i: usize) -> f64 {
+    let here = states[i].position;
+    let mut sum = 0.0;
+    for (j, other) in states.iter().enumerate() {
+        if j != i {
+            let [x, y, z] = std::array::from_fn(|d| other.position[d] - here[d]);
+            sum += recording.craft.downwash(z, libm::hypot(x, y));
+        }
+    }
+    sum
+}
+
+/// What drone `i` is asked for in control period `k`, seen from a state.
+pub(super) fn request(recording: &Trajectory, k: usize, i: usize, state: &State) -> Request {
+    let command = recording.control[k].command[i];
+    let [a, b, c, last] = command;
+    if recording.mode == Mode::Velocity {
+        let length = libm::sqrt(a * a + b * b + c * c);
+        let speed = if length == 0.0 { 0.0 } else { recording.speed_limit * last.abs() / length };
+        let target = [speed * a, speed * b, speed * c];
+        Request::velocity(state.position, state.attitude, state.velocity, target)
+    } else {
+        Request {
+            position: state.position,
+            attitude: state.attitude,
+            velocity: state.velocity,
+            target_position: [a, b, c],
+            target_velocity: [0.0; 3],
+            target_yaw: Some(last),
+            target_rates: [0.0; 3],
+        }
+    }
+}
+
+/// Intrinsic X-Y-Z angles of a rotation matrix.
+pub(super) fn intrinsic(target: &[[f64; 3]; 3]) -> [f64; 3] {
+    [
+        libm::atan2(-target[1][2], target[2][2]),
+        libm::asin(target[0][2].clamp(-1.0, 1.0)),
+        libm::atan2(-target[0][1], target[0][0]),
+    ]
+}
+
+/// Largest relative difference of an rpm.
+pub(super) fn rpm_apart(ours: [f64; 4], recorded: [f64; 4]) -> f64 {
+    ours.iter().zip(recorded).fold(0.0, |worst, (a, b)| worse(worst, (a - b).abs() / b.abs().max(1.0)))
+}
+
+/// Largest difference of angles, whole turns apart being equal.
+pub(super) fn angles_apart(ours: [f64; 3], recorded: [f64; 3]) -> f64 {
+    ours.iter().zip(recorded).fold(0.0, |worst, (a, b)| {
+        let turn = 2.0 * std::f64::consts::PI;
+        worse(worst, (a - b - turn * libm::round((a - b) / turn)).abs())
+    })
+}
+
+/// Measures the model and, in closed loop, the controller.
+pub(super) fn verify(recording: &Trajectory) -> DroneReport {
+    let mode = match recording.mode {
+        Mode::Rpm => "open loop".to_owned(),
+        Mode::Velocity => format!("velocity at {} Hz, up to {} m/s", recording.control_hz, recording.speed_limit),
+        Mode::Position => format!("position at {} Hz", recording.control_hz),
+    };
+    let mut report = DroneReport {
+        content: format!(
+            "{}, {mode}, N = {}, {} steps at {} Hz{}",
+            recording.physics_name,
+            recording.drones,
+            recording.steps(),
+            recording.physics_hz,
+            if recording.chaotic { ", chaotic" } else { "" }
+        ),
+        checks: vec![
+            Check::limited("one step", one_step(recording), DroneReport::ONE_STEP),
+            Check::limited("free run", free_run(recording), DroneReport::FREE_RUN),
+        ],
+    };
+    if recording.mode != Mode::Rpm {
+        let (rpm, trace) = controller(recording);
+        report.checks.push(Check::limited("controller rpm", rpm, DroneReport::RELATIVE));
+        report.checks.push(Check::limited("controller target", trace, DroneReport::RELATIVE));
+        let mut closed = Check::limited("closed loop", closed_loop(recording), DroneReport::FREE_RUN);
+        if recording.chaotic {
+            closed.limit = None;
+            closed.words = "chaotic: a difference of 1e-12 has grown to 1e-9 at the horizon".into();
+        }
+        report.checks.push(closed);
+    }
+    report
+}
+
+fn one_step(recording: &Trajectory) -> f64 {
+    (0..recording.steps()).fold(0.0, |worst, t| {
+        let mut flight = Flight::at(recording, t);
+        flight.step(recording, &recording.rpm[t]);
+        worse(worst, flight.apart(recording, t + 1))
+    })
+}
+
+/// From the initial state with the recorded rpm.
+fn free_run(recording: &Trajectory) -> f64 {
+    let mut flight = Flight::at(recording, 0);
+    (0..recording.horizon).fold(0.0, |worst, t| {
+        flight.step(recording, &recording.rpm[t]);
+        worse(worst, flight.apart(recording, t + 1))
+    })
+}
+
+/// The controller on the recorded states: rpm, relative; thrust and target attitude.
+fn controller(recording: &Trajectory) -> (f64, f64) {
+    let mut memories = vec![Memory::default(); recording.drones];
+    let (mut rpm, mut trace) = (0.0, 0.0);
+    for (k, recorded) in recording.control.iter().enumerate() {
+        let t = k * recording.hold;
+        for (i, memory) in memories.iter_mut().enumerate() {
+            let answer = call(recording, memory, k, i, &recording.frames[t][i]);
+            rpm = worse(rpm, rpm_apart(answer.rpm, recording.rpm[t][i]));
+            trace = worse(trace, apart(&[answer.thrust_pwm], &[recorded.thrust_pwm[i]]));
+            trace = worse(trace, angles_apart(intrinsic(&answer.target), recorded.target_euler[i]));
+        }
+    }
+    (rpm, trace)
+}
+
+pub(super) fn call(recording: &Trajectory, memory: &mut Memory, k: usize, i: usize, state: &State) -> Answer {
+    memory.call(&recording.craft, &recording.gains, &request(recording, k, i, state), recording.control_dt)
+}
+
+/// Model and controller from the initial state.
+fn closed_loop(recording: &Trajectory) -> f64 {
+    let mut flight = Flight::at(recording, 0);
+    let mut memories = vec![Memory::default(); recording.drones];
+    let mut rpm = vec![[0.0; 4]; recording.drones];
+    (0..recording.horizon).fold(0.0, |worst, t| {
+        if t % recording.hold == 0 {
+            for (i, memory) in memories.iter_mut().enumerate() {
+                rpm[i] = call(recording, memory, t / recording.hold, i, &flight.states[i]).rpm;
+            }
+        }
+        flight.step(recording, &rpm);
+        worse(worst, flight.apart(recording, t + 1))
+    })
+}

@@ -1,0 +1,159 @@
+//! The numbers behind the curves of the page, one row per line of metrics.jsonl.
+
+use magex_core::metrics_table::{METRICS, Scale};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+/// Limit of stored rows: when it is exceeded, every other row is dropped. A drawn curve has fewer pixels.
+const KEPT: usize = 2048;
+
+/// Columns that are not metrics of episodes: their name and where they are in a line.
+const COLUMNS: [(&str, &str); 17] = [
+    ("iteration", "/iteration"),
+    ("joint_env_steps", "/joint_env_steps"),
+    ("wall_s", "/wall_s"),
+    ("policy_loss", "/executor/policy_loss"),
+    ("value_loss", "/executor/value_loss"),
+    ("entropy", "/executor/entropy"),
+    ("approx_kl", "/executor/approx_kl"),
+    ("actor_grad_norm", "/executor/actor_grad_norm"),
+    ("critic_grad_norm", "/executor/critic_grad_norm"),
+    ("commander_loss", "/commander/loss"),
+    ("commander_entropy", "/commander/entropy"),
+    ("greedy_cost_ratio", "/commander/greedy_cost_ratio"),
+    ("collect_s", "/timing/collect_s"),
+    ("executor_s", "/timing/executor_s"),
+    ("commander_s", "/timing/commander_s"),
+    ("checkpoint_s", "/timing/checkpoint_s"),
+    ("joint_steps_per_s", "/joint_steps_per_s"),
+];
+
+/// The columns of metrics.jsonl for the episode metrics that have a plot.
+fn metric_columns() -> impl Iterator<Item = &'static str> {
+    let plotted = METRICS.iter().filter(|metric| metric.plot.is_some());
+    plotted.flat_map(|metric| [metric.greedy().then_some(metric.name), metric.sampled]).flatten()
+}
+
+/// The plots of the episode metrics as the page's script draws them, JSON.
+pub(super) fn plots() -> String {
+    let plots = METRICS.iter().filter_map(|metric| {
+        let scale = match metric.plot? {
+            Scale::Share => json!({ "low": 0, "high": 1, "share": true }),
+            Scale::FromOne => json!({ "line": 1 }),
+            Scale::FromZero | Scale::Free => json!({}),
+        };
+        let series =
+            [(metric.greedy().then_some(metric.name), "greedy evaluation"), (metric.sampled, "training episodes")];
+        let series: Vec<_> = series.iter().filter_map(|(column, title)| column.map(|column| [column, title])).collect();
+        Some(json!({ "name": metric.name, "title": metric.label, "scale": scale, "series": series }))
+    });
+    Value::Array(plots.collect()).to_string()
+}
+
+/// One line; missing values are NaN.
+#[derive(Debug, Clone)]
+struct Row {
+    /// Number of the line, from 1.
+    line: u64,
+    values: Vec<f32>,
+}
+
+/// Part of a curve, ready to be sent. JSON has no NaN: it becomes null.
+#[derive(Debug, Serialize)]
+pub(super) struct Rows<'a> {
+    /// Identity of the process that serves them.
+    pub(super) process: &'a str,
+    /// The rows behind this line.
+    pub(super) after: u64,
+    last: u64,
+    columns: Vec<&'static str>,
+    rows: Vec<Vec<f32>>,
+}
+
+/// Rows in order.
+#[derive(Debug, Default)]
+pub(super) struct Points {
+    rows: Vec<Row>,
+    last: u64,
+}
+
+impl Points {
+    /// Adds a line of metrics.jsonl.
+    pub(super) fn push(&mut self, line: &Value) {
+        self.last += 1;
+        let number = |value: Option<&Value>| value.and_then(Value::as_f64).map_or(f32::NAN, |x| x as f32);
+        let fixed = COLUMNS.iter().map(|(_, place)| number(line.pointer(place)));
+        let values = fixed.chain(metric_columns().map(|name| number(line.get(name)))).collect();
+        self.rows.push(Row { line: self.last, values });
+        if self.rows.len() > KEPT {
+            // From the newest backwards, so that the newest stays.
+            let newest = self.rows.len() - 1;
+            let mut index = 0;
+            self.rows.retain(|_| {
+                index += 1;
+                (newest + 1 - index).is_multiple_of(2)
+            });
+        }
+    }
+
+    /// Number of the last line.
+    pub(super) fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// The rows after a line.
+    pub(super) fn after<'a>(&self, process: &'a str, after: u64) -> Rows<'a> {
+        let from = self.rows.partition_point(|row| row.line <= after);
+        let rows = self.rows[from..].iter().map(|row| row.values.clone()).collect();
+        let columns = COLUMNS.iter().map(|(name, _)| *name).chain(metric_columns()).collect();
+        Rows { process, after, last: self.last, columns, rows }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(curve: &Points, line: u64) -> Value {
+        serde_json::to_value(curve.after("this", line)).unwrap()
+    }
+
+    fn line(iteration: u64) -> Value {
+        json!({ "iteration": iteration, "success_rate": null, "reward": -0.5, "executor": { "entropy": 1.5 } })
+    }
+
+    #[test]
+    fn rows_hold_what_a_line_says_and_null_for_the_rest() {
+        let mut curve = Points::default();
+        curve.push(&line(1));
+        curve.push(&line(2));
+        let all = after(&curve, 0);
+        let column = |name: &str| all["columns"].as_array().unwrap().iter().position(|n| n == name).unwrap();
+        assert_eq!(all["rows"].as_array().unwrap().len(), 2);
+        assert_eq!(all["rows"][1][column("iteration")], 2.0);
+        assert_eq!(all["rows"][1][column("entropy")], 1.5);
+        assert_eq!(all["rows"][1][column("reward")], -0.5);
+        assert_eq!(all["rows"][1][column("success_rate")], Value::Null);
+        assert_eq!(all["rows"][1][column("value_loss")], Value::Null);
+        let news = after(&curve, 1);
+        assert_eq!((news["rows"].as_array().unwrap().len(), &news["last"]), (1, &json!(2)));
+        assert_eq!(after(&curve, 2)["rows"], json!([]));
+        assert!(serde_json::to_string(&curve.after("this", 0)).unwrap().contains("[1.0,null,null,null"));
+        let plots: Value = serde_json::from_str(&plots()).unwrap();
+        for name in plots.as_array().unwrap().iter().flat_map(|plot| plot["series"].as_array().unwrap()) {
+            column(name[0].as_str().unwrap());
+        }
+    }
+
+    #[test]
+    fn a_long_run_is_thinned_and_keeps_its_ends() {
+        let mut curve = Points::default();
+        for iteration in 1..=100_000 {
+            curve.push(&line(iteration));
+            assert_eq!(curve.rows.last().unwrap().line, iteration);
+        }
+        assert!(curve.rows.len() <= KEPT && curve.rows.len() >= KEPT / 2);
+        assert!(curve.rows[0].line < 100 && curve.rows.is_sorted_by_key(|row| row.line));
+        assert_eq!(curve.after("this", 99_999).rows.len(), 1);
+    }
+}

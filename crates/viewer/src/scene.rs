@@ -1,0 +1,319 @@
+//! A recorded episode as a page draws it: sizes of the task and packed states. [`SCRIPT`] draws it, on the live page and in
+//! replay files.
+//!
+//! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
+//! and knows no task by name; three dimensions are seen from above, from the side and in space.
+
+use magex_core::metrics_table::{METRICS, Metric};
+use magex_core::statics::LANDMARKS;
+use magex_core::task::{Group, TaskConfig};
+use magex_core::trajectory::{EpisodeMetrics, Recording};
+use serde::{Serialize, Serializer};
+
+/// Defines `makeScene`, which draws an episode on a canvas.
+pub const SCRIPT: &str = include_str!("scene.js");
+
+/// States are stored as whole multiples of this; as a length in world units, a fifth of a pixel on a map of side 2.
+pub const UNIT: f64 = 1e-3;
+
+/// A recording that cannot be drawn.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {reason}")]
+pub struct SceneError {
+    /// Which array.
+    pub field: &'static str,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+/// What the script needs to know besides the states. Lengths are in world units.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Scene {
+    /// Side of the map, which is centred on the origin.
+    pub side: f32,
+    /// Plural name of the length unit.
+    pub length_unit: &'static str,
+    /// Display name of an agent.
+    pub agent_name: &'static str,
+    /// Display name of the state of an agent that has left the episode.
+    pub out_name: &'static str,
+    /// Radius of an agent.
+    pub agent_radius: f32,
+    /// Radius of the bodies that are not agents.
+    pub ball_radius: f32,
+    /// Radius a landmark is drawn with.
+    pub landmark_radius: f32,
+    /// Two agents closer than this are in contact.
+    pub contact_distance: f32,
+    /// A landmark is covered by a member of the last group but one of the chain within this distance.
+    pub cover_radius: f32,
+    /// Simulated seconds per step.
+    pub step_seconds: f32,
+    /// Height of the ground, if there is one.
+    pub ground: Option<f32>,
+    /// The groups from the agents to the landmarks, K + 1 of them: the k-th goal of an agent is a member of entry k + 1.
+    #[serde(serialize_with = "group_names")]
+    pub chain: Vec<Group>,
+    /// Index in `agent_state` where an agent's target velocity begins.
+    pub target_velocity: Option<usize>,
+    /// Index in `agent_state` of x of an agent's upward axis; y follows.
+    pub up: Option<usize>,
+    /// Index in `agent_state` that is 1 once an agent has crashed; a crashed agent covers no landmark.
+    pub out: Option<usize>,
+    /// [`UNIT`].
+    pub unit: f64,
+    /// Whether the task has each of [`METRICS`].
+    #[serde(skip)]
+    pub metrics: [bool; METRICS.len()],
+}
+
+impl Scene {
+    /// The sizes of a task (paper, section 5.1).
+    pub fn of(task: &TaskConfig) -> Self {
+        let (seen, stages) = (task.observation(), task.stages());
+        let flies = task.dims() == 3;
+        Self {
+            side: task.side,
+            length_unit: if flies { "metres" } else { "world units" },
+            agent_name: if flies { "drone" } else { "agent" },
+            out_name: "crashed",
+            agent_radius: seen.contact_radius / 2.0,
+            ball_radius: 0.15,
+            landmark_radius: task.landmark_radius(),
+            contact_distance: seen.contact_radius,
+            cover_radius: seen.success_radius,
+            step_seconds: task.step_seconds(),
+            ground: flies.then_some(0.0),
+            chain: stages.iter().take(1).map(|stage| stage.from).chain(stages.iter().map(|stage| stage.to)).collect(),
+            target_velocity: flies.then_some(0),
+            up: flies.then_some(3),
+            out: seen.out,
+            unit: UNIT,
+            metrics: std::array::from_fn(|row| METRICS[row].applies(task)),
+        }
+    }
+
+    /// Length of `agent_state` that the script reads.
+    pub fn agent_state(&self) -> usize {
+        let ends = [self.target_velocity.map(|x| x + 3), self.up.map(|x| x + 2), self.out.map(|x| x + 1)];
+        ends.into_iter().flatten().max().unwrap_or(0)
+    }
+
+    /// An episode, ready for the script.
+    ///
+    /// # Errors
+    /// Arrays that do not fit their shape or the task, or are not finite.
+    pub fn pack<'a>(
+        &self,
+        name: &'a str,
+        recording: &'a Recording,
+        metrics: Option<&EpisodeMetrics>,
+    ) -> Result<PackedEpisode<'a>, SceneError> {
+        let wide = self.check(recording)?;
+        let shape = &recording.shape;
+        Ok(PackedEpisode {
+            name,
+            steps: shape.steps,
+            agents: shape.agents,
+            bodies: shape.bodies,
+            landmarks: shape.landmarks,
+            dims: shape.dims,
+            agent_state: shape.agent_state,
+            goals_per_agent: shape.goals_per_agent,
+            wide,
+            positions: pack(&recording.positions, wide),
+            extra_values: pack(&recording.agent_state, wide),
+            landmarks_at: pack(recording.statics.get(LANDMARKS), wide),
+            goals: &recording.goals,
+            facts: metrics.map(|metrics| self.facts(metrics)).unwrap_or_default(),
+        })
+    }
+
+    /// Whether some number needs 32 bits.
+    fn check(&self, recording: &Recording) -> Result<bool, SceneError> {
+        let shape = &recording.shape;
+        let wrong = |field, reason| SceneError { field, reason };
+        if shape.agents == 0 || shape.dims == 0 || shape.goals_per_agent == 0 || shape.bodies < shape.agents {
+            let reason = "agents, dims and goals_per_agent must be at least 1, and bodies at least agents";
+            return Err(wrong("shape", reason.to_owned()));
+        }
+        if shape.goals_per_agent + 1 != self.chain.len() {
+            let expected = self.chain.len().saturating_sub(1);
+            return Err(wrong(
+                "shape",
+                format!("goals_per_agent is {}, the task assigns {expected} to an agent", shape.goals_per_agent),
+            ));
+        }
+        if shape.agent_state < self.agent_state() {
+            return Err(wrong(
+                "shape",
+                format!("agent_state is {}, the task has {} or more", shape.agent_state, self.agent_state()),
+            ));
+        }
+        let floats = [
+            ("positions", &*recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
+            ("agent_state", &recording.agent_state, (shape.steps + 1) * shape.agents * shape.agent_state),
+            ("landmarks", recording.statics.get(LANDMARKS), shape.landmarks * shape.dims),
+        ];
+        let mut wide = false;
+        for (field, values, expected) in floats {
+            if values.len() != expected {
+                return Err(wrong(field, format!("{} numbers, the shape asks for {expected}", values.len())));
+            }
+            if let Some(place) = values.iter().position(|x| x.is_nan() || x.abs() > 2e6) {
+                return Err(wrong(field, format!("entry {place} is {}, which cannot be drawn", values[place])));
+            }
+            wide |= values.iter().any(|&x| quantised(x).abs() > i32::from(i16::MAX));
+        }
+        if recording.goals.len() != shape.agents * shape.goals_per_agent {
+            let expected = shape.agents * shape.goals_per_agent;
+            return Err(wrong("goals", format!("{} entries, the shape asks for {expected}", recording.goals.len())));
+        }
+        for (place, &goal) in recording.goals.iter().enumerate() {
+            let group = self.chain[place % shape.goals_per_agent + 1];
+            let members = match group {
+                Group::Agents => shape.agents,
+                Group::Balls => shape.bodies - shape.agents,
+                Group::Landmarks => shape.landmarks,
+            };
+            if goal as usize >= members {
+                let reason = format!("entry {place} is {goal}, there are {members} {}", group_name(group));
+                return Err(wrong("goals", reason));
+            }
+        }
+        Ok(wide)
+    }
+
+    /// The scores of an episode: heading and value of the metrics that a replay lists and the task has.
+    pub fn facts(&self, metrics: &EpisodeMetrics) -> Vec<(&'static str, String)> {
+        let listed = METRICS.iter().zip(&self.metrics).enumerate().filter(|(_, (metric, has))| metric.replay && **has);
+        let value = |(row, (metric, _)): (usize, (&Metric, &bool))| {
+            metrics.get(row).map(|value| (metric.label, metric.write(value.into())))
+        };
+        listed.filter_map(value).collect()
+    }
+}
+
+/// One episode as the script reads it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PackedEpisode<'a> {
+    name: &'a str,
+    steps: usize,
+    agents: usize,
+    bodies: usize,
+    landmarks: usize,
+    dims: usize,
+    agent_state: usize,
+    goals_per_agent: usize,
+    /// 32-bit instead of 16-bit numbers.
+    wide: bool,
+    /// `[T+1, E, D]`, base64 of little-endian whole multiples of the unit.
+    positions: String,
+    /// `[T+1, N, X]`, the same.
+    extra_values: String,
+    /// `[G, D]`, the same.
+    landmarks_at: String,
+    /// `[N, K]`
+    goals: &'a [u32],
+    facts: Vec<(&'static str, String)>,
+}
+
+/// Name of a group in the script.
+fn group_name(group: Group) -> &'static str {
+    match group {
+        Group::Agents => "agents",
+        Group::Balls => "balls",
+        Group::Landmarks => "landmarks",
+    }
+}
+
+fn group_names<S: Serializer>(chain: &[Group], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(chain.iter().map(|&group| group_name(group)))
+}
+
+fn quantised(value: f32) -> i32 {
+    (f64::from(value) / UNIT).round() as i32
+}
+
+fn pack(values: &[f32], wide: bool) -> String {
+    let bytes: Vec<u8> = if wide {
+        values.iter().flat_map(|&x| quantised(x).to_le_bytes()).collect()
+    } else {
+        values.iter().flat_map(|&x| (quantised(x) as i16).to_le_bytes()).collect()
+    };
+    base64(&bytes)
+}
+
+/// RFC 4648, with padding.
+pub(crate) fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for group in bytes.chunks(3) {
+        let byte = |k: usize| u32::from(group.get(k).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for digit in 0..4 {
+            if digit <= group.len() {
+                text.push(char::from(DIGITS[(bits >> (18 - 6 * digit)) as usize & 63]));
+            } else {
+                text.push('=');
+            }
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::metrics_table::SECOND_COST_RATIO;
+    use magex_core::task::Spawn;
+    use magex_core::task::TaskName;
+
+    #[test]
+    fn base64_of_the_standard() {
+        for (plain, text) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
+            assert_eq!(base64(plain.as_bytes()), text);
+        }
+    }
+
+    #[test]
+    fn states_are_whole_multiples_of_the_unit() {
+        assert_eq!(quantised(-40.0), -40_000);
+        assert_eq!(quantised(0.0015), 2);
+        assert_eq!(pack(&[-1.5, 1.0], false), base64(&[0x24, 0xfa, 0xe8, 0x03]));
+        assert_eq!(pack(&[-1.5], true), base64(&[0x24, 0xfa, 0xff, 0xff]));
+    }
+
+    #[test]
+    fn each_task_brings_its_own_sizes() {
+        let scene = |name| Scene::of(&TaskConfig::of(name, 5, Spawn::Uniform));
+        let sizes = |name| {
+            let s = scene(name);
+            (s.agent_radius, s.landmark_radius, s.contact_distance, s.cover_radius, s.step_seconds)
+        };
+        assert_eq!(sizes(TaskName::SimpleSpread), (0.1, 0.05, 0.2, 0.15, 0.1));
+        assert_eq!(sizes(TaskName::PushBall), (0.1, 0.15, 0.2, 0.3, 0.1));
+        assert_eq!(sizes(TaskName::Drones), (0.06, 0.03, 0.12, 0.15, 1.0 / 30.0));
+        for name in [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones] {
+            let (task, scene) = (TaskConfig::of(name, 5, Spawn::Uniform), scene(name));
+            assert_eq!(scene.chain.len(), task.stages().len() + 1, "{name}");
+            assert_eq!((scene.agent_state(), scene.side), (task.agent_state(), task.side), "{name}");
+        }
+    }
+
+    #[test]
+    fn facts_that_a_task_does_not_have_are_left_out() {
+        let mut metrics = EpisodeMetrics([0.25; METRICS.len()]);
+        metrics[SECOND_COST_RATIO] = f32::NAN;
+        let value = |name, metrics: &EpisodeMetrics, fact: &str| {
+            let facts = Scene::of(&TaskConfig::of(name, 5, Spawn::Uniform)).facts(metrics);
+            facts.into_iter().find(|(key, _)| *key == fact).map(|(_, value)| value)
+        };
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "at spawn").as_deref(), Some("0.2500"));
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "crashed"), None);
+        assert_eq!(value(TaskName::SimpleSpread, &metrics, "second cost"), None);
+        assert_eq!(value(TaskName::Drones, &metrics, "crashed").as_deref(), Some("0.2500"));
+        metrics[SECOND_COST_RATIO] = 1.25;
+        assert_eq!(value(TaskName::PushBall, &metrics, "second cost").as_deref(), Some("1.2500"));
+    }
+}
