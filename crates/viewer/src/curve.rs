@@ -350,7 +350,8 @@ mod tests {
             .collect();
         let svg = curve_svg("run", "", &parse_metrics(&text).unwrap()).unwrap();
         assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("joint environment steps"));
-        assert_eq!((svg.matches("<polyline").count(), svg.matches("<circle").count()), (5, 29));
+        assert_eq!((svg.matches("<polyline").count(), svg.matches("<circle").count()), (8, 29));
+        assert!(svg.contains("arrival, steps") && !svg.contains("second cost"), "no panel without the metric");
         assert!(matches!(curve_svg("run", "", &[]), Err(CurveError::Empty)));
     }
 
