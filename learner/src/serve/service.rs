@@ -33,7 +33,7 @@ pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
 /// Streaming methods.
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
-/// What one caller, and everybody, may have in flight. All actors of a run may be one caller.
+/// Limits in flight, per caller and in total. All actors of a run may be one caller.
 const IN_FLIGHT: InFlightLimits = InFlightLimits { calls: 64, streams: 1024, caller_bytes: 512 << 20, bytes: 1 << 30 };
 
 /// The two ends of the service: one for the network, one for the training thread.
