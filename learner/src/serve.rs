@@ -10,6 +10,7 @@ pub(crate) mod lock_order;
 pub(crate) mod metrics;
 pub mod observer;
 pub(crate) mod roster;
+mod run_status;
 pub mod service;
 pub(crate) mod session;
 pub(crate) mod shared;

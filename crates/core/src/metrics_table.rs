@@ -3,8 +3,6 @@
 //! Every consumer loops over [`METRICS`]: environments, the wire, validation, metrics.jsonl, summary.json, plots, pages and
 //! tables. A new metric is a row here, the code that computes it, and a row in docs/metrics.md.
 
-use crate::task::{TaskConfig, TaskName};
-
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Metric {
@@ -232,15 +230,6 @@ const fn same(a: &[u8], b: &[u8]) -> bool {
 }
 
 impl Metric {
-    /// Whether a task has it.
-    pub fn applies(&self, task: &TaskConfig) -> bool {
-        match self.scope {
-            Scope::EveryTask => true,
-            Scope::Crashes => task.name == TaskName::Drones,
-            Scope::SecondStage => task.stages().len() > 1,
-        }
-    }
-
     /// Whether metrics.jsonl and summary.json have it of the greedy evaluation.
     pub fn greedy(&self) -> bool {
         self.sampled != Some(self.name)

@@ -11,7 +11,7 @@ mod simple_spread;
 mod spawn;
 
 use crate::error::{FieldError, check_range};
-use crate::metrics_table::METRICS;
+use crate::metrics_table::{METRICS, Metric, Scope};
 use crate::statics::{LANDMARKS, StaticSpec};
 use crate::trajectory::Shape;
 use crate::{sha256, toml_table};
@@ -326,6 +326,18 @@ impl TaskConfig {
         // An episode's metrics travel as numbers in the order of this process's table.
         let metrics: Vec<&str> = METRICS.iter().map(|metric| metric.name).collect();
         sha256::hex(serde_json::to_string(&(TASK_SEMANTICS, metrics, self)).unwrap_or_default().as_bytes())
+    }
+}
+
+/// Here rather than in the table, so that the table knows no task.
+impl Metric {
+    /// Whether a task has it.
+    pub fn applies(&self, task: &TaskConfig) -> bool {
+        match self.scope {
+            Scope::EveryTask => true,
+            Scope::Crashes => task.crashes(),
+            Scope::SecondStage => task.stages().len() > 1,
+        }
     }
 }
 

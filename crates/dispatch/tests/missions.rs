@@ -58,7 +58,7 @@ fn reasons(mission: &Mission) -> Vec<(&str, ChangeReason)> {
 }
 
 #[test]
-fn a_mission_begins_with_everybody_assigned() {
+fn a_mission_begins_with_all_agents_assigned() {
     let mission = start(0.5);
     let a = &mission.assignment;
     assert_eq!(goals(&mission), [("a", "x"), ("b", "y")]);

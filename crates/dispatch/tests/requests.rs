@@ -80,7 +80,7 @@ fn a_matrix_alone_makes_a_team_and_single_costs_and_bans_change_it() {
 }
 
 #[test]
-fn who_is_left_over_is_told_why() {
+fn unassigned_agents_have_a_reason() {
     let problem = read(team(&[0.0, 0.0, 5.0, 0.0, 1.0, 0.0], &[1.0, 0.5, 0.0, 0.5]));
     for kind in KINDS {
         let response = answer::write(&problem, &solve(&problem, kind));

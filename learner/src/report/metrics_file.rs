@@ -5,7 +5,6 @@ use crate::checkpoint::Progress;
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::report::bottleneck::{Bottleneck, CollectTiming, attribute};
 use crate::report::means::{ClosingMeans, EvalSummary, IterationMeans};
-use crate::report::observer::RunObserver;
 use crate::run_events::IterationReport;
 use crate::train::commander_ppo::CommanderStats;
 use crate::train::stats::UpdateStats;
@@ -247,9 +246,9 @@ impl MetricsFile {
     }
 }
 
-impl RunObserver for MetricsFile {
+impl MetricsFile {
     /// Appends a line. If it cannot be written, it is written with the next one.
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+    pub(super) fn append(&mut self, report: &IterationReport) {
         let failed_before = !self.waiting.is_empty();
         self.waiting.push_back(format!("{}\n", report.metrics_json));
         if self.waiting.len() > MAX_WAITING {
@@ -264,13 +263,14 @@ impl RunObserver for MetricsFile {
     }
 
     /// The lines written so far survive a power cut.
-    fn sync(&mut self) {
+    pub(super) fn sync(&mut self) {
         if let Err(error) = self.file.sync_data() {
             tracing::debug!(%error, "metrics.jsonl cannot be made durable");
         }
     }
 
-    fn flush(&mut self) -> Result<(), FileError> {
+    /// Writes the lines that wait.
+    pub(super) fn flush(&mut self) -> Result<(), FileError> {
         self.write_waiting().map_err(|error| FileError { path: self.path.clone(), error })
     }
 }

@@ -1,6 +1,6 @@
 //! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
 
-use crate::report::metrics_file::{FileError, IterationMetrics};
+use crate::report::metrics_file::{FileError, IterationMetrics, MetricsFile};
 use crate::run_events::{IterationReport, RunEvent};
 use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
@@ -63,4 +63,18 @@ pub trait RunObserver: Debug + Send {
 
     /// Training ends in this process.
     fn end(&mut self, _end: &RunEnd) {}
+}
+
+impl RunObserver for MetricsFile {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+        self.append(report);
+    }
+
+    fn sync(&mut self) {
+        MetricsFile::sync(self);
+    }
+
+    fn flush(&mut self) -> Result<(), FileError> {
+        MetricsFile::flush(self)
+    }
 }

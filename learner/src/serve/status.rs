@@ -1,10 +1,8 @@
 //! The status of the run: a cache of what the training thread reported, and the message that GetRun returns.
 
 use crate::run_events::IterationReport;
-use crate::serve::ledger::{Counters, Ledger};
 use crate::serve::lock_order::{OrderedMutex, Rank};
-use crate::serve::shared::Shared;
-use magex_core::ids::{ShardKind, WeightsVersion};
+use magex_core::ids::WeightsVersion;
 use magex_proto::v1;
 use std::time::Instant;
 
@@ -44,6 +42,17 @@ impl RunStatusCache {
         self.reported.lock().iterations = version.0;
     }
 
+    /// Writes what was reported, and the uptime, into the answer of `GetRun`.
+    pub(crate) fn fill(&self, status: &mut v1::RunStatus) {
+        let reported = self.reported.lock();
+        status.iteration = reported.iterations;
+        status.joint_env_steps = reported.joint_env_steps;
+        status.success = reported.success;
+        status.reward = reported.reward;
+        status.metrics_json.clone_from(&reported.metrics_json);
+        status.uptime_seconds = self.started.elapsed().as_secs_f64();
+    }
+
     pub(crate) fn finish(&self) {
         self.reported.lock().finished = true;
     }
@@ -55,82 +64,5 @@ impl RunStatusCache {
     /// The iteration that is being worked on.
     pub(crate) fn current_iteration(&self) -> u32 {
         self.reported.lock().iterations
-    }
-}
-
-impl Shared {
-    /// The status of the run.
-    pub(crate) fn run_status(&self) -> v1::RunStatus {
-        let latest = self.board.latest();
-        let sessions = self.roster.sessions();
-        // One lock for the state, the counters and the leases, so that they agree with each other.
-        let mut status = self.work.inspect(|ledger| {
-            let (done, total) = ledger.progress();
-            let rows = sessions.into_iter().map(|(session, actor)| v1::ActorStatus {
-                leases: ledger.leases_of(session) as u32,
-                actor_id: actor.actor_id,
-                address: actor.address,
-                shards_done: actor.shards_done,
-                last_seen_ms: actor.last_seen.elapsed().as_millis() as u64,
-                threads: actor.threads,
-                weights_version: actor.weights_version.map(|version| version.0),
-            });
-            let actors: Vec<v1::ActorStatus> = rows.collect();
-            v1::RunStatus {
-                state: self.run_state(actors.len(), ledger).into(),
-                actors,
-                ledger: Some(ledger_status(&ledger.counters())),
-                episodes: Some(ledger_status(&ledger.episodes())),
-                shards_done: done as u32,
-                shards_total: total as u32,
-                ..v1::RunStatus::default()
-            }
-        });
-        let reported = self.status.reported.lock();
-        status.iteration = reported.iterations;
-        status.joint_env_steps = reported.joint_env_steps;
-        status.success = reported.success;
-        status.reward = reported.reward;
-        status.metrics_json.clone_from(&reported.metrics_json);
-        drop(reported);
-        status.run_id.clone_from(&self.run.run_id.0);
-        status.name.clone_from(&self.run.name);
-        status.task_fingerprint.clone_from(&self.run.task_fingerprint);
-        status.uptime_seconds = self.status.started.elapsed().as_secs_f64();
-        if let Some(weights) = latest {
-            status.weights_version = weights.version.0;
-            status.weights_sha256.clone_from(&weights.sha256);
-        }
-        status
-    }
-
-    fn run_state(&self, actors: usize, ledger: &Ledger) -> v1::RunState {
-        let (done, total) = ledger.progress();
-        if self.status.finished() {
-            v1::RunState::Finished
-        } else if self.control.stop_requested().is_some() {
-            v1::RunState::Draining
-        } else if done >= total {
-            v1::RunState::Training
-        } else if actors == 0 {
-            v1::RunState::WaitingForActors
-        } else if ledger.plan().all(|shard| shard.kind == ShardKind::Eval) {
-            v1::RunState::Evaluating
-        } else {
-            v1::RunState::Collecting
-        }
-    }
-}
-
-fn ledger_status(counters: &Counters) -> v1::LedgerStatus {
-    v1::LedgerStatus {
-        leased: counters.leased,
-        trained: counters.trained,
-        duplicate: counters.duplicate,
-        expired: counters.expired,
-        rejected: counters.rejected,
-        failed: counters.failed,
-        outstanding: counters.outstanding,
-        residual: counters.residual() as i64,
     }
 }

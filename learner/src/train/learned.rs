@@ -1,9 +1,7 @@
 //! What learning changes: named networks with their optimisers, and the statistics of the value targets.
 
 use crate::train::adam::Adam;
-use crate::train::commander_ppo::CommanderPpo;
 use crate::train::gae::ValueNorm;
-use crate::train::mappo::Mappo;
 use magex_nets::params::{ParamError, Params, to_safetensors};
 
 /// One set of parameters with its optimiser.
@@ -36,13 +34,6 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Initial networks and optimisers.
-    pub fn init(mappo: &Mappo, commander: &CommanderPpo) -> Result<Self, ParamError> {
-        let mut networks = mappo.init()?;
-        networks.push(commander.init()?);
-        Ok(Self { networks, value_norm: mappo.value_norm() })
-    }
-
     /// The network of a name.
     pub fn network(&self, name: &str) -> Option<&Network> {
         self.networks.iter().find(|network| network.name == name)

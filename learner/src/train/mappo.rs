@@ -281,12 +281,12 @@ fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32
     huber(&(targets - values)?, delta)?.maximum(&huber(&(targets - clipped)?, delta)?)
 }
 
-/// e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond, element by element (candle-nn's has the mean of them only).
+/// e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond, element by element (candle-nn's has the mean of them only). With m = min(|e|, δ)
+/// both are m (|e| − m/2), whose gradient has no term of the size of δ that would have to cancel.
 fn huber(error: &Tensor, delta: f32) -> CandleResult<Tensor> {
     let size = error.abs()?;
     let inner = size.minimum(delta)?;
-    let outer = ((size - &inner)? * f64::from(delta))?;
-    (inner.sqr()? * 0.5)? + outer
+    &inner * (size - (&inner * 0.5)?)?
 }
 
 /// Backward; the gradient of each network as flat as its parameters, empty for networks that the loss does not read.
