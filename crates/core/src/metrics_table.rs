@@ -252,6 +252,7 @@ pub fn share(value: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::task::{TaskConfig, TaskName};
     use std::collections::BTreeSet;
 
     #[test]
