@@ -21,7 +21,7 @@ pub(crate) struct TasksArgs {
         default_value = "push-ball-5,push-ball-20,drones-2,drones-4"
     )]
     tasks: Vec<String>,
-    /// Folder with <task>.toml.
+    /// Folder with TASK.toml
     #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
     configs: PathBuf,
     /// Executors.

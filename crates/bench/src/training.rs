@@ -14,7 +14,7 @@ pub(crate) struct TrainArgs {
     /// Configuration of every run; team size, executor and seed are overridden.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Folder with spread-<N>-<executor>.toml or spread-<N>.toml; without a file, the defaults.
+    /// Folder with spread-N-EXECUTOR.toml or spread-N.toml; without a file, the defaults
     #[arg(long, value_name = "DIR", default_value = "deploy/configs")]
     configs: PathBuf,
     /// Team sizes.

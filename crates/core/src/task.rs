@@ -1,6 +1,6 @@
 //! What a task is, as data: size, horizon, spawn, reward, what is assigned to whom and what an agent sees. No physics.
 //!
-//! A task is one [`TaskName`], one variant of [`TaskSettings`] and one file (`task/<name>.rs`) with a [`Definition`];
+//! A task is one [`TaskName`], one variant of [`TaskSettings`] and one file (`task/<name>.rs`) with a `Definition`;
 //! its physics is in `magex-env`. Everything between (networks, actors, learner, commander) reads the answers given here.
 
 mod definition;

@@ -1,7 +1,7 @@
 //! The scalar of the physics: one code for f32 and f64.
 //!
 //! Rollouts use f32: the wire carries f32 (a trajectory must hold the very numbers that were simulated), and a vector
-//! register holds twice as many of them. Measured on a Zen 5 core with AVX-512 ([`mod@crate::bench`]): f32 does 1.7
+//! register holds twice as many of them. Measured on a Zen 5 core with AVX-512 (`magex-bench env`): f32 does 1.7
 //! times (N = 5) to 2.1 times (N = 50) the joint steps of f64. The golden check runs the same code in f64, where it
 //! agrees with the authors' simulator to rounding.
 //!
