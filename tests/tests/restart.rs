@@ -193,7 +193,7 @@ fn what_was_trained_is_not_begun_again_when_its_checkpoints_are_gone() {
     fs::write(policy.run().join("metrics.jsonl"), "{\"iteration\":1}\n").unwrap();
     let mut refused = policy.process(&policy.command());
     assert_eq!(refused.wait().code(), Some(73));
-    assert!(refused.log().contains("a run without checkpoints"), "{}", refused.log());
+    assert!(refused.log().contains("its checkpoints are missing"), "{}", refused.log());
     assert_eq!(fs::read_to_string(policy.run().join("metrics.jsonl")).unwrap(), "{\"iteration\":1}\n");
 }
 

@@ -169,7 +169,7 @@ fn a_model_that_gives_nonsense_is_found_out() {
 }
 
 #[test]
-fn nobody_waits_for_an_answer_that_nobody_wants() {
+fn planning_stops_when_its_caller_is_gone() {
     let coordinates: Vec<f32> = (0..24).map(|k| ((k * 37) % 23) as f32).collect();
     let problem = read(team(&coordinates, &coordinates[2..]));
     let stopped = engine::solve(&problem, AssignmentMethod::Makespan, &|| false);

@@ -73,7 +73,7 @@ fn restless(problem: &Problem) -> Result<Planned, DispatchError> {
 }
 
 #[test]
-fn who_joins_a_learned_mission_sends_nobody_elsewhere() {
+fn an_agent_that_joins_a_learned_mission_moves_no_other_agent() {
     let create = v1::CreateMissionRequest {
         mission_id: "m".into(),
         agents: vec![member("a", 0.0), member("b", 1.0)],

@@ -233,6 +233,8 @@ async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
     }
     commander.stop().await;
 
+    // Metrics are declared once per process.
+    let config = ServiceConfig { metrics: std::sync::Arc::default(), ..config };
     let commander = Commander::start_with("127.0.0.1:0", config, load_broken).await;
     let mut client = commander_client(&commander.url).await;
     let reply = client.assign(team()).await.unwrap().into_inner();
