@@ -151,7 +151,7 @@ fn the_scripted_pilot_arrives_and_alone_never_crashes() {
 }
 
 #[test]
-fn the_reference_downwash_shoots_down_who_flies_beside() {
+fn the_reference_downwash_shoots_down_a_drone_beside() {
     let weights = |above: f64, aside: f64| -Craft::CF2X.downwash(above, aside) / Craft::CF2X.weight();
     println!("weights: {:.1} {:.1} {:.1}", weights(5e-3, 0.3), weights(5e-3, 0.5), weights(1e-3, 0.5));
     assert!(weights(5e-3, 0.3) > 200.0 && weights(1e-3, 0.5) > 5.0);

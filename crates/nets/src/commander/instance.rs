@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_has_most_to_lose_picks_next() {
+    fn the_agent_with_the_largest_regret_picks_next() {
         for (case, (rows, columns)) in [(1, 1), (2, 2), (5, 9), (16, 16), (17, 33), (40, 40)].into_iter().enumerate() {
             // Few values, so that there are ties; and many.
             for values in [3, 1000] {

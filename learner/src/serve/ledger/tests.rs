@@ -127,7 +127,7 @@ fn a_restarted_actor_is_the_same_actor() {
 }
 
 #[test]
-fn a_shard_is_given_up_that_everybody_who_is_there_failed_at() {
+fn a_shard_is_given_up_after_every_connected_actor_failed_at_it() {
     let mut ledger = opened(1);
     for attempt in 1..=MAX_FAILURES {
         assert_eq!(ledger.given_up(), None, "attempt {attempt}");

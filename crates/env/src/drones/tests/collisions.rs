@@ -189,7 +189,7 @@ fn a_tilt_beyond_the_horizon_is_a_crash_in_its_step() {
 }
 
 #[test]
-fn a_state_that_is_not_finite_is_frozen_and_hurts_nobody() {
+fn a_state_that_is_not_finite_is_frozen_and_hurts_no_other_drone() {
     // The second one is within rapier's reach of the first.
     let positions = [[0.0, 0.0, 1.5], [0.126, 0.0, 1.5], [0.0, 0.6, 1.3]];
     let mut task = task(3);
