@@ -1,6 +1,6 @@
 //! Assignment of agents to goals by distance.
 //!
-//! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 6), [`bottleneck()`] minimises the longest
+//! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 4), [`bottleneck()`] minimises the longest
 //! distance instead of the sum, [`greedy()`] and [`random`] are the baselines a learned commander is
 //! compared with, and [`duals`] are entropic transport prices, a feature for such a commander.
 //!

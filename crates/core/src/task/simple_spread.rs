@@ -6,7 +6,7 @@ use crate::error::FieldError;
 use crate::toml_table;
 use serde::{Deserialize, Serialize};
 
-/// `[task.reward]`: coefficients of the reward (paper, eq. 9):
+/// `[task.reward]`: coefficients of the reward (paper, eq. 5):
 /// r = bonus · 1[d ≤ 0.15] − distance · d / d_ref − collision · #{other agents closer than 0.2}.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct RewardConfig {

@@ -1,5 +1,5 @@
 //! The paper's Goal Scheduler: all positions in, one score per goal out, goals ranked by score and handed to agents
-//! 1..N (paper, eq. 2 and 3), with the Plackett–Luce likelihood of the ranking.
+//! 1..N (paper, eq. 3), with the Plackett–Luce likelihood of the ranking.
 //!
 //! Rank r means "agent r", so the order of the indices decides whether there is anything to learn: with shuffled indices
 //! it learns nothing. Agents and goals are therefore put into a canonical spatial order first.

@@ -14,7 +14,7 @@ pub enum GraphNoise {
     Keyed(Arc<Vec<u64>>),
 }
 
-/// One block of the Graph Encoder (paper, eq. 6 and 7), all pairs of a joint state in one operation.
+/// One block of the Graph Encoder (paper, eq. 7 and 8), all pairs of a joint state in one operation.
 #[derive(Debug, Clone)]
 pub struct GraphBlock {
     /// N: agents of a joint state.

@@ -4,7 +4,7 @@ use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tenso
 use wide::f32x16;
 
 /// For every agent the mean of the *other* agents' rows: [S·N, F] → [S·N, F], N rows per joint state. This is the fully
-/// connected GCN of the paper (eq. 5) with degree normalisation and without the self term, which the caller keeps apart.
+/// connected GCN of the paper (eq. 6) with degree normalisation and without the self term, which the caller keeps apart.
 pub fn mean_of_others(x: &Tensor, agents: usize) -> Result<Tensor> {
     x.contiguous()?.apply_op1(MeanOfOthers { agents })
 }
