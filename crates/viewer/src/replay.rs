@@ -200,7 +200,7 @@ mod tests {
         let episode = &data["episodes"][0];
         assert_eq!(episode["agent_state"], 6);
         // Two bytes a number, three bytes in four digits: -1500 and 0 first, 0 and 1000 last.
-        let text = episode["extra_values"].as_str().unwrap();
+        let text = episode["agent_state_values"].as_str().unwrap();
         assert_eq!(text.len(), 24 * 2 / 3 * 4);
         assert!(text.starts_with("JPoA") && text.ends_with("AOgD"), "{text}");
 

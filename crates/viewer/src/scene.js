@@ -30,8 +30,8 @@ function makeScene(canvas, data) {
 
   // Everything a step shows is computed once per episode from the states.
   function load(source) {
-    const { steps, agents, bodies, landmarks, dims, targets } = source;
-    const [positions, places, agent_state] = [source.positions, source.landmarks_at, source.extra_values].map(text => decode(text, source.wide));
+    const { steps, agents, bodies, landmarks, dims, goals_per_agent } = source;
+    const [positions, places, agent_state] = [source.positions, source.landmarks_at, source.agent_state_values].map(text => decode(text, source.wide));
     const e = { ...source, covered: [], share: [], contact: [], pushed: [], distances: [], lost: [], touches: [0], arrival: null };
     e.at = (t, i, d) => d < dims ? positions[(t * bodies + i) * dims + d] : 0;
     e.place = (k, d) => d < dims ? places[k * dims + d] : 0;
@@ -39,7 +39,7 @@ function makeScene(canvas, data) {
     e.out = (t, i) => data.out !== null && e.extra(t, i, data.out) > 0.5;
     e.first = group => group === "balls" ? agents : 0;
     // The k-th of agent i's chain, as an index into its group.
-    e.member = (i, k) => k > 0 ? source.goals[i * targets + k - 1] : i;
+    e.member = (i, k) => k > 0 ? source.goals[i * goals_per_agent + k - 1] : i;
     const far = (a, i, b, j) => { let s = 0; for (let d = 0; d < dims; d++) s += (a[i + d] - b[j + d]) ** 2; return Math.sqrt(s); };
     const array = k => chain[k] === "landmarks" ? places : positions;
     const start = (t, i, k) => (chain[k] === "landmarks" ? e.member(i, k) : t * bodies + e.first(chain[k]) + e.member(i, k)) * dims;

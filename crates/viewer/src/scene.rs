@@ -122,7 +122,7 @@ impl Scene {
             goals_per_agent: shape.goals_per_agent,
             wide,
             positions: pack(&recording.positions, wide),
-            extra_values: pack(&recording.agent_state, wide),
+            agent_state_values: pack(&recording.agent_state, wide),
             landmarks_at: pack(recording.statics.get(LANDMARKS), wide),
             goals: &recording.goals,
             facts: metrics.map(|metrics| self.facts(metrics)).unwrap_or_default(),
@@ -195,7 +195,7 @@ impl Scene {
 }
 
 /// One episode as the script reads it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct PackedEpisode<'a> {
     name: &'a str,
     steps: usize,
@@ -210,7 +210,7 @@ pub struct PackedEpisode<'a> {
     /// `[T+1, E, D]`, base64 of little-endian whole multiples of the unit.
     positions: String,
     /// `[T+1, N, X]`, the same.
-    extra_values: String,
+    agent_state_values: String,
     /// `[G, D]`, the same.
     landmarks_at: String,
     /// `[N, K]`
@@ -298,6 +298,24 @@ mod tests {
             let (task, scene) = (TaskConfig::of(name, 5, Spawn::Uniform), scene(name));
             assert_eq!(scene.chain.len(), task.stages().len() + 1, "{name}");
             assert_eq!((scene.agent_state(), scene.side), (task.agent_state(), task.side), "{name}");
+        }
+    }
+
+    /// The script has no compiler that would notice a renamed field.
+    #[test]
+    fn the_script_reads_only_fields_that_are_written() {
+        let head = SCRIPT.lines().find_map(|line| line.trim().strip_prefix("const { ")?.strip_suffix(" } = source;"));
+        let mut read: Vec<&str> = head.expect("the fields of an episode").split(", ").collect();
+        let word = |text: &'static str| text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').next();
+        read.extend(SCRIPT.split("source.").skip(1).filter_map(word));
+        let task = TaskConfig::of(TaskName::SimpleSpread, 5, Spawn::Uniform);
+        let packed = serde_json::to_value(PackedEpisode::default()).unwrap();
+        let scene = serde_json::to_value(Scene::of(&task)).unwrap();
+        for field in read {
+            assert!(packed.get(field).is_some(), "scene.js reads source.{field}, which no episode has");
+        }
+        for field in SCRIPT.split("data.").skip(1).filter_map(word) {
+            assert!(scene.get(field).is_some(), "scene.js reads data.{field}, which no scene has");
         }
     }
 
