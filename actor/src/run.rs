@@ -26,7 +26,7 @@ const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
 const POOL_SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Where an actor works.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct ActorConfig {
     /// The learner, `http://host:port`.
     pub learner_url: String,

@@ -12,7 +12,7 @@ use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
 use magex_runtime::net::auth::{Role, caller};
-use magex_runtime::net::in_flight::InFlight;
+use magex_runtime::net::in_flight::{CallKind, InFlight};
 use magex_runtime::{status, trace};
 use std::sync::Arc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -39,6 +39,19 @@ pub(crate) struct CommanderApi {
     pub(crate) in_flight: Arc<InFlight>,
     pub(crate) limits: Limits,
     pub(crate) draining: CancellationToken,
+}
+
+impl CommanderApi {
+    /// Sets the gauges that are computed on demand.
+    pub(crate) fn refresh_gauges(&self) {
+        let metrics = &self.answering.metrics;
+        metrics.in_flight.set(self.in_flight.count(CallKind::Call) as f64);
+        metrics.streams.set(self.in_flight.count(CallKind::Stream) as f64);
+        metrics.missions.set(self.missions.missions.count() as f64);
+        metrics.backlog.set(self.missions.events.len() as f64);
+        metrics.weights_version.set(self.store.latest().map_or(-1.0, |(key, _)| f64::from(key.version.0)));
+        metrics.free_processors.set(self.answering.processors.available_permits() as f64);
+    }
 }
 
 type Answer<T> = Result<Response<T>, Status>;

@@ -2,7 +2,7 @@
 
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
-use crate::cancel::CancelOnDrop;
+use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, WeightsKey};
@@ -80,13 +80,8 @@ impl ShardAssign {
         let Ok(Some(places)) = tokio::time::timeout(QUEUE_TIMEOUT.min(budget.left()), places).await else {
             return Err(status::resource_exhausted("all threads are busy with other shards", Duration::from_secs(1)));
         };
-        let cancel = CancelOnDrop::default();
-        let work = cancel.work(budget);
-        let solving = tokio::task::spawn_blocking(move || {
-            let _held = places;
-            scheduler.assign_batch(&request, &|| work.should_continue())
-        });
-        solving.await.map_err(|error| Status::internal(error.to_string()))?.map_err(to_status)
+        let solve = move |work: &Work| scheduler.assign_batch(&request, &|| work.should_continue());
+        on_thread(places, budget, solve).await?.map_err(to_status)
     }
 }
 

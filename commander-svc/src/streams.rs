@@ -116,7 +116,7 @@ pub(crate) async fn watch(
     draining: CancellationToken,
 ) {
     // Subscribes first, so that no change during the snapshot is missed.
-    let mut events = missions.events();
+    let mut events = missions.events.subscribe();
     let Some(mut sent) = snapshot(&missions, &interest, &watcher).await else { return };
     loop {
         let event = tokio::select! {

@@ -139,9 +139,7 @@ impl GoalRequest {
         let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
         let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
         let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
-        if stages == 0 {
-            return Err(FieldError::new("agents", "0 stages; send at least one assignment problem per episode"));
-        }
+        FieldError::ensure(stages > 0, || ("agents", "0 stages; send at least one assignment problem per episode"))?;
         let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
         let request = Self { shard, seed: message.seed, stages, agent_count, goal_count, dims, agents, goals };
@@ -168,11 +166,10 @@ impl GoalReply {
     /// The first field that is invalid.
     pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, FieldError> {
         let problems = [request.shard.episodes as usize, request.stages];
-        if message.version != request.shard.version.0 {
-            let problem =
-                format!("version {} answered a request to version {}", message.version, request.shard.version);
-            return Err(FieldError::new("version", problem));
-        }
+        let (found, asked) = (message.version, request.shard.version);
+        FieldError::ensure(found == asked.0, || {
+            ("version", format!("version {found} answered a request to version {asked}"))
+        })?;
         let goals = arrays::to_u32("goals", message.goals, &[problems[0], problems[1], request.agent_count])?;
         if let Some(goal) = goals.iter().find(|&&goal| goal as usize >= request.goal_count) {
             return Err(FieldError::new("goals", format!("{goal} is not below {}", request.goal_count)));

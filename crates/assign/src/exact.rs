@@ -11,8 +11,7 @@
 
 mod shortlist;
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, compensated_sum, distances_into};
-
+use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cost_of, distances_into};
 use shortlist::{Shortlists, WORTH_IT};
 
 const NONE: u32 = u32::MAX;
@@ -57,11 +56,6 @@ struct Branch {
     col: u32,
     /// Length of the path to that column.
     length: f64,
-}
-
-/// Solves one problem; see [`Solver::solve`]. A caller with many problems keeps a [`Solver`].
-pub fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
-    Solver::default().solve(cost, rows, cols)
 }
 
 /// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
@@ -131,7 +125,7 @@ impl Solver {
                 }
             }
         }
-        let cost = compensated_sum(crate::pairs(&col_of_row).map(|(row, col)| cost[row * cols + col]));
+        let cost = cost_of(cost, cols, &col_of_row);
         Ok(Assignment { col_of_row, cost })
     }
 

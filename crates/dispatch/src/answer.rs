@@ -42,16 +42,16 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     }
     response.largest_cost = largest.unwrap_or(0.0);
     response.unassigned_goals.extend((0..g as u32).filter(|&goal| free[goal as usize]));
-    response.agents_without_goal =
-        reasons(&response.unassigned_agents, &problem.agent_ids, &plan.isolated.agents, n > g);
-    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, &plan.isolated.goals, g > n);
+    let [agents, goals] = &plan.isolated;
+    response.agents_without_goal = reasons(&response.unassigned_agents, &problem.agent_ids, agents, n > g);
+    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, goals, g > n);
     let left = |(now, then): (&u32, &u32)| *then != UNASSIGNED && now != then;
     response.switches = plan.goal_of.iter().zip(&problem.current).filter(|pair| left(*pair)).count() as u32;
     response
 }
 
 /// cost / exact − 1; `None` where it is undefined.
-pub(crate) fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
+fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
     let exact = exact?;
     if exact > 0.0 {
         // The sums are rounded in different orders.

@@ -6,10 +6,10 @@
 
 mod sticky;
 
+use crate::UNASSIGNED;
 use crate::problem::Problem;
-use crate::{DispatchError, UNASSIGNED};
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy_allowed};
+use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy, pairs};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use std::cell::RefCell;
@@ -35,22 +35,13 @@ pub struct Plan {
     pub exact_cost: Option<f64>,
     /// `[N]` cost of each agent's pair; 0 without one.
     pub pair_costs: Vec<f64>,
-    /// The members without a partner whose pairs are all forbidden.
-    pub isolated: Isolated,
-}
-
-/// Members whose pairs are all forbidden.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Isolated {
-    /// Agents, ascending.
-    pub agents: Vec<u32>,
-    /// Goals, ascending.
-    pub goals: Vec<u32>,
+    /// Agents, and goals, whose pairs are all forbidden, ascending.
+    pub isolated: [Vec<u32>; 2],
 }
 
 /// Buffers that are reused from problem to problem.
 #[derive(Debug, Default)]
-pub struct Workspace {
+struct Workspace {
     solver: Solver,
     makespan: BottleneckSolver,
     costs: Vec<f64>,
@@ -61,19 +52,53 @@ thread_local! {
     static WORKSPACE: RefCell<Workspace> = RefCell::default();
 }
 
-/// Solves with the buffers of this thread. `should_continue` is called from time to time.
+/// Calls `work` with the buffers of this thread.
+fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
+    WORKSPACE.with_borrow_mut(|workspace| {
+        let done = work(workspace);
+        workspace.solver.forget_beyond(KEPT_CELLS);
+        workspace.makespan.forget_beyond(KEPT_CELLS);
+        for buffer in [&mut workspace.costs, &mut workspace.adjusted] {
+            if buffer.capacity() > KEPT_CELLS {
+                *buffer = Vec::new();
+            }
+        }
+        done
+    })
+}
+
+/// Solves by a method; the exact one answers in place of the learned one. `should_continue` is called from time to time.
 ///
 /// # Errors
-/// [`DispatchError::Interrupted`] when `should_continue` returns false.
+/// [`AssignError::Interrupted`] when `should_continue` returns false.
 pub fn solve(
     problem: &Problem,
     kind: AssignmentMethod,
     should_continue: &dyn Fn() -> bool,
-) -> Result<Plan, DispatchError> {
-    WORKSPACE.with_borrow_mut(|workspace| {
-        let plan = workspace.solve(problem, kind, should_continue);
-        workspace.forget();
-        plan
+) -> Result<Plan, AssignError> {
+    with_workspace(|workspace| {
+        let (rows, cols) = (problem.agent_count, problem.goal_count);
+        problem.costs_into(&mut workspace.costs)?;
+        let sticky = workspace.adjust(problem);
+        let Workspace { solver, makespan, costs, adjusted } = workspace;
+        let target: &[f64] = if sticky { adjusted } else { costs };
+        let mut exact_cost = None;
+        let (goal_of, scheduler) = match kind {
+            AssignmentMethod::Exact | AssignmentMethod::Learned => {
+                let answer = solver.solve_allowed(target, rows, cols, should_continue)?;
+                exact_cost = (!sticky).then_some(answer.cost);
+                (answer.col_of_row, AssignmentMethod::Exact)
+            }
+            AssignmentMethod::Makespan => {
+                (makespan.solve_allowed(target, rows, cols, should_continue)?.col_of_row, kind)
+            }
+            AssignmentMethod::Greedy => (greedy(target, rows, cols, should_continue)?.col_of_row, kind),
+            AssignmentMethod::Random => {
+                let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
+                (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
+            }
+        };
+        workspace.finish(problem, goal_of, None, scheduler, exact_cost, should_continue)
     })
 }
 
@@ -88,10 +113,16 @@ pub fn adopt(
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Plan, String> {
     check(problem, &goals, probabilities.as_deref())?;
-    WORKSPACE.with_borrow_mut(|workspace| {
-        let plan = workspace.adopt(problem, goals, probabilities, should_continue);
-        workspace.forget();
-        plan
+    let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
+    with_workspace(|workspace| {
+        let cols = problem.goal_count;
+        problem.costs_into(&mut workspace.costs).map_err(|error| error.to_string())?;
+        let costs = &workspace.costs;
+        if let Some((agent, goal)) = pairs(&wish).find(|(agent, goal)| costs[agent * cols + goal] == f64::INFINITY) {
+            return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
+        }
+        let planned = workspace.follow(problem, &wish, probabilities, should_continue);
+        planned.map_err(|error| error.to_string())
     })
 }
 
@@ -110,73 +141,24 @@ pub fn learned_cells(problem: &Problem) -> usize {
 }
 
 impl Workspace {
-    fn forget(&mut self) {
-        self.solver.forget_beyond(KEPT_CELLS);
-        self.makespan.forget_beyond(KEPT_CELLS);
-        for buffer in [&mut self.costs, &mut self.adjusted] {
-            if buffer.capacity() > KEPT_CELLS {
-                *buffer = Vec::new();
-            }
-        }
-    }
-
-    fn solve(
+    /// Follows an allowed matching, except where leaving current pairs costs more than it saves.
+    fn follow(
         &mut self,
         problem: &Problem,
-        kind: AssignmentMethod,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, DispatchError> {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
-        problem.costs_into(&mut self.costs)?;
-        let sticky = self.adjust(problem);
-        let Self { solver, makespan, costs, adjusted } = self;
-        let target: &[f64] = if sticky { adjusted } else { costs };
-        let mut exact_cost = None;
-        let goal_of = match kind {
-            // Exact is the fallback of learned.
-            AssignmentMethod::Exact | AssignmentMethod::Learned => {
-                let answer = solver.solve_allowed(target, rows, cols, should_continue).map_err(refused)?;
-                exact_cost = (!sticky).then_some(answer.cost);
-                answer.col_of_row
-            }
-            AssignmentMethod::Makespan => {
-                makespan.solve_allowed(target, rows, cols, should_continue).map_err(refused)?.assignment.col_of_row
-            }
-            AssignmentMethod::Greedy => {
-                greedy_allowed(target, rows, cols, should_continue).map_err(refused)?.col_of_row
-            }
-            AssignmentMethod::Random => {
-                let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                random_allowed(costs, rows, cols, &mut stream, should_continue).map_err(refused)?
-            }
-        };
-        let kind = if kind == AssignmentMethod::Learned { AssignmentMethod::Exact } else { kind };
-        self.finish(problem, goal_of, None, kind, exact_cost, should_continue)
-    }
-
-    fn adopt(
-        &mut self,
-        problem: &Problem,
-        goals: Vec<Option<u32>>,
+        wish: &[u32],
         probabilities: Option<Vec<f32>>,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, String> {
-        let cols = problem.goal_count;
-        problem.costs_into(&mut self.costs).map_err(|error| error.to_string())?;
-        let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
-        let forbidden = pairs(&wish).find(|&(agent, goal)| self.costs[agent * cols + goal] == f64::INFINITY);
-        if let Some((agent, goal)) = forbidden {
-            return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
-        }
-        let mut goal_of = wish.clone();
-        if self.adjust(problem) {
-            goal_of = sticky::follow(&wish, &self.adjusted, cols, &problem.current, &mut self.solver, should_continue)
-                .map_err(|error| refused(error).to_string())?;
-        }
+    ) -> Result<Plan, AssignError> {
+        let goal_of = match self.adjust(problem) {
+            true => {
+                let Self { solver, adjusted, .. } = self;
+                sticky::follow(wish, adjusted, problem.goal_count, &problem.current, solver, should_continue)?
+            }
+            false => wish.to_vec(),
+        };
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
         self.finish(problem, goal_of, probabilities, AssignmentMethod::Learned, None, should_continue)
-            .map_err(|error| error.to_string())
     }
 
     /// Fills the adjusted costs if there are current pairs.
@@ -200,7 +182,7 @@ impl Workspace {
         scheduler: AssignmentMethod,
         exact_cost: Option<f64>,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, DispatchError> {
+    ) -> Result<Plan, AssignError> {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         let Self { solver, costs, .. } = self;
         let cost = cost_of(costs, cols, &goal_of);
@@ -211,7 +193,7 @@ impl Workspace {
                     Ok(exact) => (exact.pairs().count() == pairs(&goal_of).count()).then_some(exact.cost),
                     // The answer is complete; only its gap is missing.
                     Err(AssignError::Interrupted) => None,
-                    Err(other) => return Err(refused(other)),
+                    Err(other) => return Err(other),
                 }
             }
             None => None,
@@ -221,40 +203,26 @@ impl Workspace {
             goal => costs[agent * cols + goal as usize],
         };
         let pair_costs = goal_of.iter().enumerate().map(cost_of_pair).collect();
-        let isolated = if problem.forbidden.is_empty() { Isolated::default() } else { isolated(costs, rows, cols) };
+        let isolated = if problem.forbidden.is_empty() { Default::default() } else { isolated(costs, cols) };
         Ok(Plan { goal_of, probabilities, scheduler, cost, exact_cost, pair_costs, isolated })
     }
 }
 
-fn isolated(costs: &[f64], rows: usize, cols: usize) -> Isolated {
-    let mut goals = vec![true; cols];
-    let mut found = Isolated::default();
-    for (agent, row) in costs.chunks_exact(cols).take(rows).enumerate() {
-        let mut none = true;
-        for (cost, goal) in row.iter().zip(&mut goals) {
+/// Agents, and goals, whose pairs are all forbidden.
+fn isolated(costs: &[f64], cols: usize) -> [Vec<u32>; 2] {
+    let (mut agents, mut lonely) = (Vec::new(), vec![true; cols]);
+    for (agent, row) in (0u32..).zip(costs.chunks_exact(cols)) {
+        let mut allowed = false;
+        for (cost, lonely) in row.iter().zip(&mut lonely) {
             if *cost < f64::INFINITY {
-                (none, *goal) = (false, false);
+                (allowed, *lonely) = (true, false);
             }
         }
-        if none {
-            found.agents.push(agent as u32);
+        if !allowed {
+            agents.push(agent);
         }
     }
-    found.goals = (0..cols as u32).filter(|&goal| goals[goal as usize]).collect();
-    found
-}
-
-/// (agent, goal) of every pair, agents ascending.
-pub(crate) fn pairs(goal_of: &[u32]) -> impl Iterator<Item = (usize, usize)> + '_ {
-    goal_of.iter().enumerate().filter(|(_, goal)| **goal != UNASSIGNED).map(|(agent, &goal)| (agent, goal as usize))
-}
-
-fn refused(error: AssignError) -> DispatchError {
-    match error {
-        AssignError::Interrupted => DispatchError::Interrupted,
-        // Impossible for a checked problem, but an error must not be lost.
-        other => DispatchError::invalid("costs", other.to_string()),
-    }
+    [agents, (0u32..).zip(lonely).filter_map(|(goal, lonely)| lonely.then_some(goal)).collect()]
 }
 
 /// Checks that the answer is a matching of min(N, G) pairs.

@@ -5,10 +5,9 @@ mod changes;
 mod members;
 
 use crate::engine::Plan;
-use crate::problem::{Problem, finite_cost, switching_cost};
-use crate::{DispatchError, UNASSIGNED, answer};
+use crate::problem::{Problem, pairs, priced_pairs, switching_cost};
+use crate::{AssignError, UNASSIGNED, answer};
 use changes::sentence;
-use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
@@ -43,7 +42,7 @@ pub struct Planned {
 }
 
 /// Solves a problem with the available methods.
-pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, DispatchError> + 'a;
+pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, AssignError> + 'a;
 
 /// Names of an agent and of a goal.
 type Names = (String, String);
@@ -95,13 +94,12 @@ impl Mission {
         now: i64,
         limits: &MissionLimits,
         planner: &Planner<'_>,
-    ) -> Result<Self, DispatchError> {
+    ) -> Result<Self, AssignError> {
         let id = if request.mission_id.is_empty() { drawn_id.to_owned() } else { request.mission_id };
         check_id(&id)?;
-        if request.title.len() > LONGEST_TITLE {
-            let problem = format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len());
-            return Err(DispatchError::invalid("title", problem));
-        }
+        ConvertError::ensure(request.title.len() <= LONGEST_TITLE, || {
+            ("title", format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len()))
+        })?;
         check_lengths(
             limits,
             &[
@@ -128,8 +126,10 @@ impl Mission {
             lifetime_ms: lifetime(request.lifetime_seconds, limits)?,
         };
         mission.upsert(request.agents, request.goals, limits)?;
-        mission.forbid("forbidden", &request.forbidden)?;
-        mission.price("cost_overrides", &request.cost_overrides)?;
+        let known = MemberNames::of(&mission.assignment);
+        let names = |pair: &v1::PairRef| known.names(pair);
+        mission.forbidden.extend(pairs("forbidden", &request.forbidden, names)?);
+        mission.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
         mission.check_size(limits)?;
         mission.plan(&Removed::default(), now, planner)?;
         Ok(mission)
@@ -145,7 +145,7 @@ impl Mission {
         now: i64,
         limits: &MissionLimits,
         planner: &Planner<'_>,
-    ) -> Result<Self, DispatchError> {
+    ) -> Result<Self, AssignError> {
         check_lengths(
             limits,
             &[
@@ -162,17 +162,15 @@ impl Mission {
         let mut next = self.clone();
         let removed = next.remove(&request.remove_agents, &request.remove_goals)?;
         next.upsert(request.agents, request.goals, limits)?;
-        next.forbid("forbid", &request.forbid)?;
         let known = MemberNames::of(&next.assignment);
-        for (k, pair) in request.allow.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
-            next.forbidden.remove(&names);
+        let names = |pair: &v1::PairRef| known.names(pair);
+        next.forbidden.extend(pairs("forbid", &request.forbid, names)?);
+        for allowed in pairs("allow", &request.allow, names)? {
+            next.forbidden.remove(&allowed);
         }
-        next.price("cost_overrides", &request.cost_overrides)?;
-        let known = MemberNames::of(&next.assignment);
-        for (k, pair) in request.clear_cost_overrides.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
-            next.overrides.remove(&names);
+        next.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
+        for cleared in pairs("clear_cost_overrides", &request.clear_cost_overrides, names)? {
+            next.overrides.remove(&cleared);
         }
         if let Some(cost) = request.switching_cost {
             next.assignment.switching_cost = switching_cost(cost)?;
@@ -234,7 +232,7 @@ impl Mission {
         agents: Vec<v1::Member>,
         goals: Vec<v1::Member>,
         limits: &MissionLimits,
-    ) -> Result<(), DispatchError> {
+    ) -> Result<(), AssignError> {
         let first = |members: &[v1::Member]| members.iter().map(|member| member.position.len()).find(|&len| len > 0);
         let a = &mut self.assignment;
         let dims = first(&a.agents).or(first(&a.goals)).or(first(&agents)).or(first(&goals)).unwrap_or(2);
@@ -243,12 +241,12 @@ impl Mission {
         Ok(())
     }
 
-    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Removed, DispatchError> {
+    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Removed, AssignError> {
         let a = &mut self.assignment;
         for (field, members, ids) in [("remove_agents", &mut a.agents, agents), ("remove_goals", &mut a.goals, goals)] {
             let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
             if let Some(k) = ids.iter().position(|id| !left.remove(id.as_str())) {
-                return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
+                return Err(AssignError::invalid(format!("{field}[{k}]"), "no member has this name"));
             }
             let ids: HashSet<&str> = ids.iter().map(String::as_str).collect();
             members.retain(|member| !ids.contains(member.id.as_str()));
@@ -260,32 +258,10 @@ impl Mission {
         Ok(removed)
     }
 
-    fn forbid(&mut self, field: &str, pairs: &[v1::PairRef]) -> Result<(), DispatchError> {
-        let known = MemberNames::of(&self.assignment);
-        for (k, pair) in pairs.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
-            self.forbidden.insert(names);
-        }
-        Ok(())
-    }
-
-    fn price(&mut self, field: &str, items: &[v1::PairCost]) -> Result<(), DispatchError> {
-        let known = MemberNames::of(&self.assignment);
-        for (k, item) in items.iter().enumerate() {
-            let path = format!("{field}[{k}]");
-            let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{path}.pair")))?;
-            let names = known.names(pair).map_err(|e| e.within(&format!("{path}.pair")))?;
-            self.overrides.insert(names, finite_cost(item.cost, || format!("{path}.cost"))?);
-        }
-        Ok(())
-    }
-
-    fn check_size(&self, limits: &MissionLimits) -> Result<(), DispatchError> {
+    fn check_size(&self, limits: &MissionLimits) -> Result<(), AssignError> {
         let most = most_pairs(limits);
         for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
-            if count > most {
-                return Err(DispatchError::invalid(field, format!("{count} pairs exceed the limit of {most}")));
-            }
+            ConvertError::ensure(count <= most, || (field, format!("{count} pairs exceed the limit of {most}")))?;
         }
         Ok(())
     }
@@ -310,40 +286,27 @@ impl Mission {
         for (row, col) in a.pairs.iter().filter_map(|pair| find(&pair.agent_id, &pair.goal_id)) {
             current[row as usize] = col;
         }
+        let priced = self.overrides.iter().filter_map(|((agent, goal), &cost)| {
+            let (row, col) = find(agent, goal)?;
+            Some((row, col, cost))
+        });
+        let dims = a.agents[agents[0]].position.len();
         let problem = Problem {
-            agent_count: agents.len(),
-            goal_count: goals.len(),
-            dims: a.agents[agents[0]].position.len(),
-            agents: points(&a.agents, &agents),
-            goals: points(&a.goals, &goals),
-            agent_ids: Vec::new(),
-            goal_ids: Vec::new(),
-            matrix: None,
-            overrides: self
-                .overrides
-                .iter()
-                .filter_map(|((agent, goal), &cost)| find(agent, goal).map(|(row, col)| (row, col, cost)))
-                .collect(),
+            overrides: priced.collect(),
             forbidden: self.forbidden.iter().filter_map(|(agent, goal)| find(agent, goal)).collect(),
             current,
             switching_cost: a.switching_cost,
             scheduler: a.scheduler().into(),
-            mode: Mode::Greedy,
             seed: a.revision,
-            deadline: None,
+            ..Problem::of_points(points(&a.agents, &agents), points(&a.goals, &goals), dims)
         };
         Some((problem, agents, goals))
     }
 
-    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), DispatchError> {
-        let before = std::mem::take(&mut self.assignment.pairs);
-        // The problem reads the current pairs.
-        self.assignment.pairs.clone_from(&before);
+    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), AssignError> {
+        let before = self.assignment.pairs.clone();
         let solved = match self.problem() {
-            Some((problem, agents, goals)) => {
-                let planned = planner(&problem)?;
-                Some((problem, planned, agents, goals))
-            }
+            Some((problem, agents, goals)) => Some((planner(&problem)?, problem, agents, goals)),
             None => None,
         };
         let a = &mut self.assignment;
@@ -355,7 +318,7 @@ impl Mission {
         a.answered_by = a.scheduler;
         (a.fallback_reason, a.version, a.sha256, a.run_id) = Default::default();
         let (mut idle_agents, mut idle_goals) = (BTreeMap::new(), BTreeMap::new());
-        if let Some((problem, planned, agents, goals)) = &solved {
+        if let Some((planned, problem, agents, goals)) = &solved {
             let response = answer::write(problem, &planned.plan);
             (a.cost, a.largest_cost) = (response.cost, response.largest_cost);
             (a.exact_cost, a.gap) = (response.exact_cost, response.gap);
@@ -413,27 +376,24 @@ impl Mission {
                 continue;
             }
             let state = |members: &HashMap<String, v1::Member>, id: &str| members.get(id).map(v1::Member::state);
-            let reason = match from {
-                None => v1::ChangeReason::Assigned,
-                Some(goal) => {
-                    match (state(&agents, agent), state(&goals, goal), removed.goals.iter().any(|id| id == goal)) {
-                        (None, ..) => v1::ChangeReason::AgentRemoved,
-                        (Some(v1::MemberState::Failed), ..) => v1::ChangeReason::AgentFailed,
-                        (Some(v1::MemberState::Finished), ..) => v1::ChangeReason::AgentFinished,
-                        (_, None, _) | (_, _, true) => v1::ChangeReason::GoalRemoved,
-                        (_, Some(v1::MemberState::Failed), _) => v1::ChangeReason::GoalFailed,
-                        (_, Some(v1::MemberState::Finished), _) => v1::ChangeReason::GoalFinished,
-                        _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
-                            v1::ChangeReason::PairForbidden
-                        }
-                        _ if to.is_none() => v1::ChangeReason::Displaced,
-                        _ => v1::ChangeReason::Switched,
+            let gone = |removed: &[String], id: &str| removed.iter().any(|other| other == id);
+            let reason = match (from, state(&agents, agent)) {
+                (None, _) => v1::ChangeReason::Assigned,
+                (_, None) => v1::ChangeReason::AgentRemoved,
+                _ if gone(&removed.agents, agent) => v1::ChangeReason::AgentRemoved,
+                (_, Some(v1::MemberState::Failed)) => v1::ChangeReason::AgentFailed,
+                (_, Some(v1::MemberState::Finished)) => v1::ChangeReason::AgentFinished,
+                (Some(goal), _) => match state(&goals, goal) {
+                    None => v1::ChangeReason::GoalRemoved,
+                    _ if gone(&removed.goals, goal) => v1::ChangeReason::GoalRemoved,
+                    Some(v1::MemberState::Failed) => v1::ChangeReason::GoalFailed,
+                    Some(v1::MemberState::Finished) => v1::ChangeReason::GoalFinished,
+                    _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
+                        v1::ChangeReason::PairForbidden
                     }
-                }
-            };
-            let reason = match removed.agents.iter().any(|id| id == agent) && from.is_some() {
-                true => v1::ChangeReason::AgentRemoved,
-                false => reason,
+                    _ if to.is_none() => v1::ChangeReason::Displaced,
+                    _ => v1::ChangeReason::Switched,
+                },
             };
             let gain = from.zip(to).and_then(|(from, to)| Some(cost(agent, from)? - cost(agent, to)?));
             changes.push(v1::Change {

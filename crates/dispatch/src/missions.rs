@@ -138,7 +138,7 @@ impl Missions {
 
     /// Number of missions.
     pub fn count(&self) -> usize {
-        self.kept.read().unwrap_or_else(PoisonError::into_inner).len()
+        self.read().len()
     }
 
     /// The limits.
@@ -188,18 +188,12 @@ impl Missions {
     }
 
     fn room(&self, kept: &Kept, owner: &str) -> Result<(), KeepError> {
-        if kept.len() >= self.bounds.total {
-            return Err(KeepError::Full(format!(
-                "the service is at its limit of {} missions; delete some",
-                self.bounds.total
-            )));
-        }
         let own = kept.values().filter(|mission| mission.assignment.owner == owner).count();
-        if own >= self.bounds.per_owner {
-            return Err(KeepError::Full(format!(
-                "the client is at its limit of {} missions; delete some",
-                self.bounds.per_owner
-            )));
+        let (total, per_owner) = (self.bounds.total, self.bounds.per_owner);
+        for (who, count, most) in [("service", kept.len(), total), ("client", own, per_owner)] {
+            if count >= most {
+                return Err(KeepError::Full(format!("the {who} is at its limit of {most} missions; delete some")));
+            }
         }
         Ok(())
     }
@@ -212,15 +206,14 @@ impl Missions {
         let mut writing = self.lock();
         // Another owner's mission of the same name must look like a missing one.
         match self.get(mission.id()).filter(|now| now.assignment.owner == mission.assignment.owner) {
-            None => return Err(KeepError::Missing(mission.id().to_owned())),
+            None => Err(KeepError::Missing(mission.id().to_owned())),
             Some(now)
-                if now.assignment.revision != was || now.assignment.created_ms != mission.assignment.created_ms =>
+                if (now.assignment.revision, now.assignment.created_ms) == (was, mission.assignment.created_ms) =>
             {
-                return Err(KeepError::Changed { id: mission.id().to_owned(), found: now.assignment.revision });
+                self.put(&mut writing, mission)
             }
-            Some(_) => {}
+            Some(now) => Err(KeepError::Changed { id: mission.id().to_owned(), found: now.assignment.revision }),
         }
-        self.put(&mut writing, mission)
     }
 
     /// Deletes a mission if `may` allows it. Check and deletion are atomic.

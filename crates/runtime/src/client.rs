@@ -1,5 +1,6 @@
 //! Clients of services: channels with TLS and credentials.
 
+use crate::exit::{self, Failure};
 use crate::tls::ClientTls;
 use std::path::Path;
 use std::time::Duration;
@@ -28,44 +29,18 @@ pub enum UrlError {
     Exposed(String),
 }
 
-/// Why there is no connection.
-#[derive(Debug, thiserror::Error)]
-pub enum ConnectError {
-    /// The URL cannot be used.
-    #[error(transparent)]
-    Url(#[from] UrlError),
-    /// The connection failed.
-    #[error(transparent)]
-    Transport(#[from] transport::Error),
-}
-
 /// A bearer token. Debug output does not show it.
-#[derive(Clone, PartialEq, Eq)]
+#[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
-
-/// Why a token is unusable. The message does not contain it.
-#[derive(Debug, thiserror::Error)]
-pub enum TokenError {
-    /// Its file cannot be read.
-    #[error("the token's file {path}: {source}")]
-    File {
-        /// Its name.
-        path: String,
-        /// The error of the system.
-        source: std::io::Error,
-    },
-    /// Its form.
-    #[error("{0}: a token is one line of printable ASCII")]
-    Form(String),
-}
 
 impl Token {
     /// A token, without surrounding whitespace; `source` names its origin in errors.
     ///
     /// # Errors
-    /// It contains characters that a header cannot carry.
-    pub fn new(text: &str, source: &str) -> Result<Self, TokenError> {
-        let (text, wrong) = (text.trim(), || TokenError::Form(source.to_owned()));
+    /// Wrong usage: it contains characters that a header cannot carry. The message does not contain it.
+    pub fn new(text: &str, source: &str) -> Result<Self, Failure> {
+        let wrong = || Failure::usage(format!("{source}: a token is one line of printable ASCII"));
+        let text = text.trim();
         if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
             return Err(wrong());
         }
@@ -77,11 +52,11 @@ impl Token {
     /// Reads a token from a file.
     ///
     /// # Errors
-    /// The file cannot be read, or holds no token.
-    pub fn read(path: &Path) -> Result<Self, TokenError> {
-        let name = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|source| TokenError::File { path: name.clone(), source })?;
-        Self::new(&text, &name)
+    /// Wrong usage: the file cannot be read, or holds no token.
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| Failure::usage(format!("the token's file {}: {error}", path.display())))?;
+        Self::new(&text, &path.display().to_string())
     }
 }
 
@@ -93,7 +68,7 @@ impl std::fmt::Debug for Token {
 }
 
 /// The credentials of a client and the CA that it trusts; read once for all connections.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default)]
 pub struct Settings {
     /// For https.
     pub tls: Option<ClientTls>,
@@ -113,13 +88,14 @@ impl Settings {
         Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
     }
 
-    /// A connected channel.
+    /// A connected channel. Wrong usage has the exit code of [`Failure::usage`], a failed connection [`exit::UNAVAILABLE`].
     ///
     /// # Errors
     /// The URL is malformed, the token would be sent without TLS, or the connection failed.
-    pub async fn connect(&self, url: &str) -> Result<Channel, ConnectError> {
-        let (endpoint, bearer) = self.endpoint(url)?;
-        Ok(InterceptedService::new(endpoint.connect().await?, bearer))
+    pub async fn connect(&self, url: &str) -> Result<Channel, Failure> {
+        let (endpoint, bearer) = self.endpoint(url).map_err(Failure::usage)?;
+        let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
+        Ok(InterceptedService::new(channel, bearer))
     }
 
     fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), UrlError> {
@@ -130,6 +106,15 @@ impl Settings {
         }
         Ok((endpoint, Bearer(self.token.clone())))
     }
+}
+
+/// The innermost error: the outer ones of a transport carry no detail.
+pub(crate) fn root_of(error: &dyn std::error::Error) -> String {
+    let mut root = error;
+    while let Some(source) = root.source() {
+        root = source;
+    }
+    root.to_string()
 }
 
 /// Whether a host is this machine: a loopback address, or `localhost`.
@@ -162,12 +147,11 @@ pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
 /// An endpoint that takes the certificates for an https URL from the environment.
 ///
 /// # Errors
-/// The URL is malformed, or the certificates cannot be read.
-pub fn endpoint_from_env(url: &str) -> Result<Endpoint, UrlError> {
+/// Wrong usage: the URL is malformed, or the certificates cannot be read.
+pub fn endpoint_from_env(url: &str) -> Result<Endpoint, Failure> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
-    let tls = secure.then(ClientTls::from_env).transpose();
-    let tls = tls.map_err(|error| UrlError::Form { url: url.to_owned(), reason: error.to_string() })?;
-    endpoint_with(url, tls.as_ref())
+    let tls = secure.then(ClientTls::from_env).transpose()?;
+    endpoint_with(url, tls.as_ref()).map_err(Failure::usage)
 }
 
 /// An endpoint with our settings: a dead peer is detected within 15 s, even on an idle connection. Certificates apply to https
@@ -181,7 +165,7 @@ pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, Url
     let endpoint = match (endpoint.uri().scheme_str(), tls) {
         _ if endpoint.uri().host().is_none() => return Err(wrong("no host".to_owned())),
         (Some("http"), _) => endpoint,
-        (Some("https"), Some(tls)) => endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?,
+        (Some("https"), Some(tls)) => endpoint.tls_config(tls.0.clone()).map_err(|error| wrong(error.to_string()))?,
         (Some("https"), None) => {
             let problem = "name the CA of its certificate: MAGEX_TLS_CA or --tls-ca";
             return Err(wrong(problem.to_owned()));

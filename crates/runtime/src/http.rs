@@ -2,9 +2,10 @@
 //!
 //! Read-only and optional: training does not depend on it.
 
+use crate::exit::Failure;
 use crate::metrics::Metrics;
 use crate::net::connections::{ConnectionLimits, Incoming};
-use crate::server::{self, BindError, GRACE};
+use crate::server::{self, GRACE};
 pub use axum::Router;
 use axum::extract::connect_info::Connected;
 use axum::extract::{ConnectInfo, Request};
@@ -38,7 +39,7 @@ impl HttpArgs {
     ///
     /// # Errors
     /// The address is malformed or in use.
-    pub async fn bind(&self) -> Result<Option<Page>, BindError> {
+    pub async fn bind(&self) -> Result<Option<Page>, Failure> {
         match &self.http {
             Some(listen) => bind(listen).await.map(Some),
             None => Ok(None),
@@ -74,7 +75,7 @@ impl Page {
 ///
 /// # Errors
 /// The address is malformed or in use.
-pub async fn bind(listen: &str) -> Result<Page, BindError> {
+pub async fn bind(listen: &str) -> Result<Page, Failure> {
     let (listener, address) = server::listener(listen, "--http").await?;
     Ok(Page { incoming: Incoming::new(listener, CONNECTIONS), address })
 }

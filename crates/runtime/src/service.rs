@@ -4,7 +4,7 @@
 use crate::exit::{self, Failure};
 use crate::http::{HttpArgs, Page, Router};
 use crate::net::connections::ConnectionLimits;
-use crate::server::{self, BindError, Incoming};
+use crate::server::{self, Incoming};
 use crate::telemetry::{self, LogFormat, TraceArgs};
 use crate::{process, shutdown};
 use clap::Args;
@@ -54,7 +54,7 @@ impl Context {
     /// # Errors
     /// The address is malformed or in use.
     pub async fn listen(&mut self, listen: &str, limits: ConnectionLimits) -> Result<(Incoming, SocketAddr), Failure> {
-        let (incoming, address) = server::bind(listen).await.map_err(unavailable)?;
+        let (incoming, address) = server::bind(listen).await?;
         self.address = Some(address);
         Ok((incoming.within(limits), address))
     }
@@ -93,20 +93,16 @@ pub fn main<T>(
         .map_err(internal)?;
     let telemetry = {
         let _runtime = runtime.enter();
-        telemetry::init(&format!("magex-{name}"), args.log_format, &args.traces).map_err(Failure::usage)?
+        telemetry::init(&format!("magex-{name}"), args.log_format, &args.traces)?
     };
     process::log_environment();
     let result = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(internal)?;
-        let page = args.http.bind().await.map_err(unavailable)?;
+        let page = args.http.bind().await?;
         run(Context { stop, name, address: None, page }).await
     });
     telemetry.flush();
     // A thread that still works must not delay the end.
     runtime.shutdown_background();
     result
-}
-
-fn unavailable(error: BindError) -> Failure {
-    Failure::new(exit::UNAVAILABLE, error)
 }

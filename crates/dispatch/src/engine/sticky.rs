@@ -1,9 +1,8 @@
 //! Switching costs: current pairs are made cheaper, and a preferred matching that ignores them is followed only where it saves
 //! more than the switches cost.
 
-use super::pairs;
 use crate::UNASSIGNED;
-use magex_assign::{AssignError, Solver};
+use magex_assign::{AssignError, Solver, pairs};
 
 /// Minimum gain of leaving a pair, relative to its own cost: more than the rounding of sums.
 const WORTH: f64 = 1e-9;

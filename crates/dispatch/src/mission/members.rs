@@ -1,8 +1,7 @@
 //! Checks the members and settings of a mission in requests and records.
 
 use super::{MissionLimits, Names, TRAINING_PREFIX};
-use crate::DispatchError;
-use crate::problem::{LONGEST_ID, finite_cost, scheduler, switching_cost};
+use crate::problem::{LONGEST_ID, check_name, finite_cost, scheduler, switching_cost};
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
@@ -14,15 +13,14 @@ pub(super) fn most_pairs(limits: &MissionLimits) -> usize {
 }
 
 /// Rejects oversized lists before they are processed.
-pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), DispatchError> {
+pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), ConvertError> {
     let most = most_pairs(limits);
-    match lists.iter().find(|(_, count)| *count > most) {
-        Some((field, count)) => Err(DispatchError::invalid(
-            *field,
-            format!("{count} entries exceed the limit of {most}; send fewer at a time"),
-        )),
-        None => Ok(()),
+    for &(field, count) in lists {
+        ConvertError::ensure(count <= most, || {
+            (field, format!("{count} entries exceed the limit of {most}; send fewer at a time"))
+        })?;
     }
+    Ok(())
 }
 
 /// The names of a mission's members.
@@ -59,14 +57,12 @@ pub(super) fn merge(
     updates: Vec<v1::Member>,
     dims: usize,
     limits: &MissionLimits,
-) -> Result<(), DispatchError> {
+) -> Result<(), ConvertError> {
     let mut places: HashMap<String, usize> = members.iter().enumerate().map(|(k, m)| (m.id.clone(), k)).collect();
     let mut seen = BTreeSet::new();
     for (k, update) in updates.into_iter().enumerate() {
-        let wrong = |part: &str, problem: String| Err(DispatchError::invalid(format!("{field}[{k}].{part}"), problem));
-        if update.id.is_empty() || update.id.len() > LONGEST_ID {
-            return wrong("id", format!("{} bytes; a name has 1 to {LONGEST_ID}", update.id.len()));
-        }
+        let wrong = |part: &str, problem: String| Err(ConvertError::new(format!("{field}[{k}].{part}"), problem));
+        check_name(&update.id, || format!("{field}[{k}].id"))?;
         if !seen.insert(update.id.clone()) {
             return wrong("id", "duplicate name".to_owned());
         }
@@ -82,10 +78,8 @@ pub(super) fn merge(
                 return wrong("position", format!("{} coordinates; give 2 or 3", update.position.len()));
             }
             if update.position.len() != dims {
-                return wrong(
-                    "position",
-                    format!("{} coordinates, but other members have {dims}", update.position.len()),
-                );
+                let problem = format!("{} coordinates, but other members have {dims}", update.position.len());
+                return wrong("position", problem);
             }
         }
         match known {
@@ -111,41 +105,37 @@ pub(super) fn merge(
     Ok(())
 }
 
-pub(super) fn sticky_scheduler(value: i32) -> Result<Option<AssignmentMethod>, DispatchError> {
-    let kind = scheduler("scheduler", value)?;
-    if kind == Some(AssignmentMethod::Random) {
-        return Err(DispatchError::invalid(
-            "scheduler",
-            "random is not allowed for a mission; use exact, makespan, greedy or learned",
-        ));
-    }
+pub(super) fn sticky_scheduler(value: i32) -> Result<Option<AssignmentMethod>, ConvertError> {
+    let kind = scheduler(value)?;
+    ConvertError::ensure(kind != Some(AssignmentMethod::Random), || {
+        ("scheduler", "random is not allowed for a mission; use exact, makespan, greedy or learned")
+    })?;
     Ok(kind)
 }
 
-pub(super) fn check_id(id: &str) -> Result<(), DispatchError> {
+pub(super) fn check_id(id: &str) -> Result<(), ConvertError> {
     let fits = id.len() <= LONGEST_ID && id.bytes().all(|b| b.is_ascii_alphanumeric() || b"._-".contains(&b));
-    if fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX) {
-        return Ok(());
-    }
-    let problem =
-        format!("use 1 to {LONGEST_ID} characters of A-Z a-z 0-9 . _ -, not starting with '{TRAINING_PREFIX}'");
-    Err(DispatchError::invalid("mission_id", problem))
+    ConvertError::ensure(fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX), || {
+        let form =
+            format!("use 1 to {LONGEST_ID} characters of A-Z a-z 0-9 . _ -, not starting with '{TRAINING_PREFIX}'");
+        ("mission_id", form)
+    })
 }
 
-pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, DispatchError> {
+pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, ConvertError> {
     let Some(seconds) = seconds else { return Ok(limits.lifetime_ms) };
     let most = limits.lifetime_ms as f64 / 1e3;
-    if seconds > 0.0 && seconds <= most {
-        return Ok(((seconds * 1e3) as i64).max(1));
-    }
-    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is outside 0..={most}; give a positive number")))
+    ConvertError::ensure(seconds > 0.0 && seconds <= most, || {
+        ("lifetime_seconds", format!("{seconds} is outside 0..={most}; give a positive number"))
+    })?;
+    Ok(((seconds * 1e3) as i64).max(1))
 }
 
 /// Checks a record by the rules of requests, on which updates rely.
 pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Result<(), ConvertError> {
     let wrong = |field: String, problem: &str| Err(ConvertError::new(field, problem.to_owned()));
-    check_id(&a.mission_id).map_err(|error| ConvertError::new("mission_id", error.to_string()))?;
-    sticky_scheduler(a.scheduler).map_err(|error| ConvertError::new("scheduler", error.to_string()))?;
+    check_id(&a.mission_id)?;
+    sticky_scheduler(a.scheduler)?;
     switching_cost(a.switching_cost)?;
     if a.revision == u64::MAX {
         return wrong("revision".to_owned(), "u64::MAX cannot be incremented");
@@ -159,10 +149,8 @@ pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Re
             }
             let position = &member.position;
             if position.len() != dims || !(2..=3).contains(&dims) || position.iter().any(|x| !x.is_finite()) {
-                return wrong(
-                    format!("{field}[{k}].position"),
-                    "coordinates are not finite, or their number differs from other members",
-                );
+                let problem = "coordinates are not finite, or their number differs from other members";
+                return wrong(format!("{field}[{k}].position"), problem);
             }
             if !v1::MemberState::try_from(member.state).is_ok_and(|state| state != v1::MemberState::Unspecified) {
                 return wrong(format!("{field}[{k}].state"), "unknown");

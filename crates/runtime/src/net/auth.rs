@@ -9,6 +9,7 @@
 //! token_sha256 = "…"        # or certificate_sha256 = "…" (of the DER form)
 //! ```
 
+use crate::exit::Failure;
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
@@ -42,14 +43,6 @@ pub struct Caller {
     pub role: Role,
 }
 
-/// A file of identities cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{path}: {problem}")]
-pub struct AccessError {
-    path: String,
-    problem: String,
-}
-
 /// The identities that may call.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
@@ -79,11 +72,11 @@ impl Access {
     /// Reads a file of identities.
     ///
     /// # Errors
-    /// The file cannot be read, or an identity is invalid.
-    pub fn read(path: &Path) -> Result<Self, AccessError> {
-        let wrong = |problem: String| AccessError { path: path.display().to_string(), problem };
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        Self::parse(&text).map_err(wrong)
+    /// Wrong usage: the file cannot be read, or an identity is invalid.
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let text = std::fs::read_to_string(path).map_err(|error| error.to_string());
+        let access = text.and_then(|text| Self::parse(&text));
+        access.map_err(|problem| Failure::usage(format!("{}: {problem}", path.display())))
     }
 
     fn parse(text: &str) -> Result<Self, String> {
