@@ -112,7 +112,7 @@ impl CommanderService for CommanderApi {
         trace::continue_from(&span, trace::of(request.metadata()));
         let budget = budget(&request);
         let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(to_status)?;
-        shard_assign::check(&request, &key, &self.limits)?;
+        shard_assign::check(&request, &key, &self.limits).map_err(to_status)?;
         let version = request.shard.version;
         let request = Arc::new(request);
         let answer = self.shards.answer(request.clone(), &key, budget, &self.draining);

@@ -19,9 +19,6 @@ pub struct RunScheduler {
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
-///
-/// # Errors
-/// The configuration or the weights are invalid.
 pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     let config = RunConfig::from_toml(run_config_toml).map_err(|error| SchedulerError::Load(error.to_string()))?;
     let commander = match Commander::classical(config.commander.kind) {

@@ -6,6 +6,7 @@ use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, WeightsKey};
+use magex_core::error::FieldError;
 use magex_dispatch::Limits;
 use magex_runtime::status;
 use std::sync::Arc;
@@ -86,31 +87,24 @@ impl ShardAssign {
 }
 
 /// Rejects requests of unbounded memory or time. The lengths of the arrays bound the rest.
-pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) -> Result<(), Status> {
+pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) -> Result<(), FieldError> {
     let (n, g) = (request.agent_count, request.goal_count);
     for (field, found, most) in [
         ("agents.shape[2]", n, limits.members),
         ("goals.shape[2]", g, limits.members),
         ("agents.shape[3]", request.dims, 3),
     ] {
-        if found == 0 || found > most {
-            return Err(status::invalid_argument(field, format!("{found} is outside 1..={most}")));
-        }
+        let ok = (1..=most).contains(&found);
+        FieldError::ensure(ok, || (field, format!("{found} is outside 1..={most}")))?;
     }
     let teams = (request.shard.episodes as usize).saturating_mul(request.stages);
-    if teams > TEAMS {
-        return Err(status::invalid_argument("agents.shape", format!("{teams} teams exceed the limit of {TEAMS}")));
-    }
-    let pairs = teams.saturating_mul(n).saturating_mul(g);
-    if pairs > PAIRS {
-        let problem =
-            format!("{teams} teams of {n} agents and {g} goals exceed the limit of {PAIRS} pairs; send fewer teams");
-        return Err(status::invalid_argument("agents.shape", problem));
-    }
+    FieldError::ensure(teams <= TEAMS, || ("agents.shape", format!("{teams} teams exceed the limit of {TEAMS}")))?;
+    FieldError::ensure(teams.saturating_mul(n).saturating_mul(g) <= PAIRS, || {
+        let size = format!("{teams} teams of {n} agents and {g} goals");
+        ("agents.shape", format!("{size} exceed the limit of {PAIRS} pairs; send fewer teams"))
+    })?;
     for (field, length, most) in [("run_id", key.run_id.0.len(), RUN_ID), ("sha256", key.sha256.len(), SHA256)] {
-        if length > most {
-            return Err(status::invalid_argument(field, format!("{length} bytes exceed the limit of {most}")));
-        }
+        FieldError::ensure(length <= most, || (field, format!("{length} bytes exceed the limit of {most}")))?;
     }
     Ok(())
 }
@@ -156,9 +150,9 @@ mod tests {
             (GoalRequest { agent_count: 5000, goal_count: 5000, ..good.clone() }, "the limit of 64000000 pairs"),
         ] {
             let refused = check(&request, &key, &limits).unwrap_err();
-            assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(words), "{refused}");
+            assert!(refused.to_string().contains(words), "{refused}");
         }
         let long = WeightsKey { run_id: RunId("r".repeat(129)), ..key };
-        assert!(check(&good, &long, &limits).unwrap_err().message().starts_with("run_id"));
+        assert!(check(&good, &long, &limits).unwrap_err().field.starts_with("run_id"));
     }
 }

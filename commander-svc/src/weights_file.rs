@@ -37,10 +37,7 @@ type Stamp = [(SystemTime, u64); 2];
 type Content = [String; 2];
 
 impl WeightsFile {
-    /// A run folder, or a weights file with the configuration given or beside it.
-    ///
-    /// # Errors
-    /// A file is missing.
+    /// A run folder, or a weights file with the configuration given or beside it. Both must exist.
     pub fn find(path: &Path, config: Option<&Path>) -> Result<Self, Failure> {
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         let (weights, beside) = if path.is_dir() {

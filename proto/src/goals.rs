@@ -58,13 +58,8 @@ impl From<AssignmentMethod> for v1::AssignmentMethod {
 
 impl From<v1::AssignmentMethod> for AssignmentMethod {
     fn from(kind: v1::AssignmentMethod) -> Self {
-        match kind {
-            v1::AssignmentMethod::Unspecified | v1::AssignmentMethod::Learned => Self::Learned,
-            v1::AssignmentMethod::Exact => Self::Exact,
-            v1::AssignmentMethod::Greedy => Self::Greedy,
-            v1::AssignmentMethod::Random => Self::Random,
-            v1::AssignmentMethod::Makespan => Self::Makespan,
-        }
+        // Learned unless specified.
+        Self::ALL.into_iter().find(|method| v1::AssignmentMethod::from(*method) == kind).unwrap_or_default()
     }
 }
 
@@ -161,9 +156,6 @@ impl GoalReply {
     }
 
     /// Reads the reply to a request: shapes match, numbers are finite, and goals exist.
-    ///
-    /// # Errors
-    /// The first field that is invalid.
     pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, FieldError> {
         let problems = [request.shard.episodes as usize, request.stages];
         let (found, asked) = (message.version, request.shard.version);

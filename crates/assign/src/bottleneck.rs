@@ -21,9 +21,7 @@ pub struct BottleneckSolver {
 impl BottleneckSolver {
     /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where a cost of +∞ forbids a pair; among those the smallest
     /// largest cost, and among those the smallest sum. Stops as soon as `should_continue` returns false.
-    ///
-    /// # Errors
-    /// As [`Solver::solve_allowed`].
+    /// Fails as [`Solver::solve_allowed`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],

@@ -77,9 +77,6 @@ impl Solver {
 
     /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
     /// Stops as soon as `should_continue` returns false; it is called once per shortest-path search.
-    ///
-    /// # Errors
-    /// As [`Solver::solve`], and [`AssignError::Interrupted`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],
@@ -130,9 +127,6 @@ impl Solver {
     }
 
     /// [`exact_points`] with this solver's memory.
-    ///
-    /// # Errors
-    /// Empty or ragged arrays and coordinates that are not finite.
     pub fn solve_points(&mut self, agents: &[f32], goals: &[f32], dims: usize) -> Result<Assignment, AssignError> {
         let mut points = std::mem::take(&mut self.points);
         let answer =

@@ -102,10 +102,7 @@ pub fn solve(
     })
 }
 
-/// Makes a plan of the answer of the learned method.
-///
-/// # Errors
-/// Why it is not a valid matching, as the reason of a fallback.
+/// Makes a plan of the answer of the learned method. An error is the reason of a fallback.
 pub fn adopt(
     problem: &Problem,
     goals: Vec<Option<u32>>,

@@ -84,9 +84,7 @@ impl Mission {
     }
 
     /// Creates and plans a mission. `drawn_id` is its name if the request has none; `now` is milliseconds since 1970.
-    ///
-    /// # Errors
-    /// The first invalid field, or the planner's error.
+    /// An error names the first invalid field, or is the planner's.
     pub fn create(
         request: v1::CreateMissionRequest,
         owner: &str,
@@ -100,17 +98,8 @@ impl Mission {
         ConvertError::ensure(request.title.len() <= LONGEST_TITLE, || {
             ("title", format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len()))
         })?;
-        check_lengths(
-            limits,
-            &[
-                ("agents", request.agents.len()),
-                ("goals", request.goals.len()),
-                ("forbidden", request.forbidden.len()),
-                ("cost_overrides", request.cost_overrides.len()),
-            ],
-        )?;
         let kind = sticky_scheduler(request.scheduler)?.unwrap_or(AssignmentMethod::Exact);
-        let mut mission = Self {
+        let empty = Self {
             assignment: v1::Assignment {
                 mission_id: id,
                 title: request.title,
@@ -125,22 +114,32 @@ impl Mission {
             overrides: BTreeMap::new(),
             lifetime_ms: lifetime(request.lifetime_seconds, limits)?,
         };
-        mission.upsert(request.agents, request.goals, limits)?;
-        let known = MemberNames::of(&mission.assignment);
-        let names = |pair: &v1::PairRef| known.names(pair);
-        mission.forbidden.extend(pairs("forbidden", &request.forbidden, names)?);
-        mission.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
-        mission.check_size(limits)?;
-        mission.plan(&Removed::default(), now, planner)?;
-        Ok(mission)
+        let content = v1::UpdateMissionRequest {
+            agents: request.agents,
+            goals: request.goals,
+            forbid: request.forbidden,
+            cost_overrides: request.cost_overrides,
+            ..Default::default()
+        };
+        empty.change("forbidden", content, now, limits, planner)
     }
 
     /// Computes and plans the next revision; this one is unchanged.
-    ///
-    /// # Errors
-    /// The first invalid field, or the planner's error.
+    /// An error names the first invalid field, or is the planner's.
     pub fn update(
         &self,
+        request: v1::UpdateMissionRequest,
+        now: i64,
+        limits: &MissionLimits,
+        planner: &Planner<'_>,
+    ) -> Result<Self, AssignError> {
+        self.clone().change("forbid", request, now, limits, planner)
+    }
+
+    /// Applies a request, in which `forbid` is the name of the list of pairs to forbid, and plans.
+    fn change(
+        mut self,
+        forbid: &str,
         request: v1::UpdateMissionRequest,
         now: i64,
         limits: &MissionLimits,
@@ -153,34 +152,33 @@ impl Mission {
                 ("goals", request.goals.len()),
                 ("remove_agents", request.remove_agents.len()),
                 ("remove_goals", request.remove_goals.len()),
-                ("forbid", request.forbid.len()),
+                (forbid, request.forbid.len()),
                 ("allow", request.allow.len()),
                 ("cost_overrides", request.cost_overrides.len()),
                 ("clear_cost_overrides", request.clear_cost_overrides.len()),
             ],
         )?;
-        let mut next = self.clone();
-        let removed = next.remove(&request.remove_agents, &request.remove_goals)?;
-        next.upsert(request.agents, request.goals, limits)?;
-        let known = MemberNames::of(&next.assignment);
+        let removed = self.remove(&request.remove_agents, &request.remove_goals)?;
+        self.upsert(request.agents, request.goals, limits)?;
+        let known = MemberNames::of(&self.assignment);
         let names = |pair: &v1::PairRef| known.names(pair);
-        next.forbidden.extend(pairs("forbid", &request.forbid, names)?);
+        self.forbidden.extend(pairs(forbid, &request.forbid, names)?);
         for allowed in pairs("allow", &request.allow, names)? {
-            next.forbidden.remove(&allowed);
+            self.forbidden.remove(&allowed);
         }
-        next.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
+        self.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
         for cleared in pairs("clear_cost_overrides", &request.clear_cost_overrides, names)? {
-            next.overrides.remove(&cleared);
+            self.overrides.remove(&cleared);
         }
         if let Some(cost) = request.switching_cost {
-            next.assignment.switching_cost = switching_cost(cost)?;
+            self.assignment.switching_cost = switching_cost(cost)?;
         }
         if let Some(kind) = sticky_scheduler(request.scheduler)? {
-            next.assignment.scheduler = v1::AssignmentMethod::from(kind).into();
+            self.assignment.scheduler = v1::AssignmentMethod::from(kind).into();
         }
-        next.check_size(limits)?;
-        next.plan(&removed, now, planner)?;
-        Ok(next)
+        self.check_size(limits)?;
+        self.plan(&removed, now, planner)?;
+        Ok(self)
     }
 
     /// Its name.
@@ -195,23 +193,17 @@ impl Mission {
             goal_id: goal.clone(),
             ..Default::default()
         };
+        let priced = |(names, &cost): (&Names, &f64)| v1::PairCost { pair: Some(pair(names)), cost };
         let record = Record {
             assignment: Some(self.assignment.clone()),
             forbidden: self.forbidden.iter().map(pair).collect(),
-            overrides: self
-                .overrides
-                .iter()
-                .map(|(names, &cost)| v1::PairCost { pair: Some(pair(names)), cost })
-                .collect(),
+            overrides: self.overrides.iter().map(priced).collect(),
             lifetime_ms: self.lifetime_ms,
         };
         prost::Message::encode_to_vec(&record)
     }
 
-    /// Decodes a record on disk.
-    ///
-    /// # Errors
-    /// The bytes are no record, or not that of a valid mission.
+    /// Decodes a record on disk. It must be that of a valid mission.
     pub fn decode(bytes: &[u8]) -> Result<Self, ConvertError> {
         let record: Record =
             prost::Message::decode(bytes).map_err(|error| ConvertError::new("mission", error.to_string()))?;

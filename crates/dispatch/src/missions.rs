@@ -3,10 +3,10 @@
 //! An update computes revision r + 1 from revision r, writes it to disk, and commits it only if r is still current (optimistic
 //! concurrency). Otherwise the caller re-plans.
 
-use crate::disk::{Disk, DiskError};
+use crate::disk::{Disk, DiskError, Kept};
 use crate::mission::{Mission, MissionLimits};
 use magex_proto::v1;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 /// Limits of the missions of a service.
@@ -58,9 +58,6 @@ pub enum KeepError {
     #[error("the missions cannot be written, so nothing was changed: {0}; free space on the disk of --data and retry")]
     Disk(#[from] DiskError),
 }
-
-/// By name.
-type Kept = BTreeMap<String, Arc<Mission>>;
 
 /// Where changes are stored.
 #[derive(Debug)]
@@ -124,9 +121,6 @@ pub struct Missions {
 
 impl Missions {
     /// Loads the missions of a file; without a file they are lost when the process ends.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub fn open(disk: Option<Disk>, bounds: Bounds) -> Result<Self, DiskError> {
         let loaded = disk.as_ref().map(Disk::load).transpose()?.unwrap_or_default();
         let journal = disk.map_or(Journal::Memory, Journal::Disk);
@@ -180,9 +174,6 @@ impl Missions {
     }
 
     /// Whether one more mission of this owner may be stored.
-    ///
-    /// # Errors
-    /// [`KeepError::Full`].
     pub fn check_room(&self, owner: &str) -> Result<(), KeepError> {
         self.room(&self.read(), owner)
     }
@@ -231,9 +222,6 @@ impl Missions {
     }
 
     /// Deletes the missions that have expired at `now` (milliseconds since 1970), and returns them.
-    ///
-    /// # Errors
-    /// The write failed.
     pub fn expire(&self, now: i64) -> Result<Vec<Arc<Mission>>, KeepError> {
         let mut writing = self.lock();
         let old: Vec<Arc<Mission>> =

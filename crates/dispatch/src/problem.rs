@@ -92,10 +92,7 @@ impl Problem {
         }
     }
 
-    /// Parses a request. `seed` is the seed of a request without one.
-    ///
-    /// # Errors
-    /// The first invalid field, by its path.
+    /// Parses a request. `seed` is the seed of a request without one. An error names the first invalid field by its path.
     pub fn read(message: v1::AssignRequest, seed: u64, limits: &Limits) -> Result<Self, ConvertError> {
         let scheduler = scheduler(message.scheduler)?.unwrap_or_default();
         let mode = match v1::Mode::try_from(message.mode) {

@@ -50,9 +50,6 @@ impl Token {
     }
 
     /// Reads a token from a file.
-    ///
-    /// # Errors
-    /// Wrong usage: the file cannot be read, or holds no token.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| Failure::usage(format!("the token's file {}: {error}", path.display())))?;
@@ -79,19 +76,13 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// A channel that connects with the first call and reconnects after failures.
-    ///
-    /// # Errors
-    /// The URL is malformed, or the token would be sent without TLS.
+    /// A channel that connects with the first call and reconnects after failures. Fails if the token would be sent without TLS.
     pub fn lazy_channel(&self, url: &str) -> Result<Channel, UrlError> {
         let (endpoint, bearer) = self.endpoint(url)?;
         Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
     }
 
     /// A connected channel. Wrong usage has the exit code of [`Failure::usage`], a failed connection [`exit::UNAVAILABLE`].
-    ///
-    /// # Errors
-    /// The URL is malformed, the token would be sent without TLS, or the connection failed.
     pub async fn connect(&self, url: &str) -> Result<Channel, Failure> {
         let (endpoint, bearer) = self.endpoint(url).map_err(Failure::usage)?;
         let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
@@ -137,17 +128,11 @@ impl Interceptor for Bearer {
 }
 
 /// An endpoint with our settings, without certificates.
-///
-/// # Errors
-/// The URL is malformed.
 pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
     endpoint_with(url, None)
 }
 
 /// An endpoint that takes the certificates for an https URL from the environment.
-///
-/// # Errors
-/// Wrong usage: the URL is malformed, or the certificates cannot be read.
 pub fn endpoint_from_env(url: &str) -> Result<Endpoint, Failure> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
     let tls = secure.then(ClientTls::from_env).transpose()?;
@@ -156,9 +141,6 @@ pub fn endpoint_from_env(url: &str) -> Result<Endpoint, Failure> {
 
 /// An endpoint with our settings: a dead peer is detected within 15 s, even on an idle connection. Certificates apply to https
 /// only.
-///
-/// # Errors
-/// The URL is malformed.
 pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
     let wrong = |reason: String| UrlError::Form { url: url.to_owned(), reason };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;

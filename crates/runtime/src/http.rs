@@ -36,9 +36,6 @@ pub struct HttpArgs {
 
 impl HttpArgs {
     /// Listens, if an address is given. Must be called within a runtime.
-    ///
-    /// # Errors
-    /// The address is malformed or in use.
     pub async fn bind(&self) -> Result<Option<Page>, Failure> {
         match &self.http {
             Some(listen) => bind(listen).await.map(Some),
@@ -72,9 +69,6 @@ impl Page {
 }
 
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
-///
-/// # Errors
-/// The address is malformed or in use.
 pub async fn bind(listen: &str) -> Result<Page, Failure> {
     let (listener, address) = server::listener(listen, "--http").await?;
     Ok(Page { incoming: Incoming::new(listener, CONNECTIONS), address })

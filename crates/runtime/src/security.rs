@@ -54,9 +54,6 @@ impl ServerArgs {
 
     /// Reads the files that the options name. A non-loopback address needs TLS and authentication, unless `--insecure` is
     /// given.
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid, or the address is exposed.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
         let access = self.identities.as_deref().map(Access::read).transpose()?;
         let tls = match (&self.tls_cert, &self.tls_key) {
@@ -67,7 +64,7 @@ impl ServerArgs {
             server::secure_builder(Some(tls)).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
         }
         let security = Security { tls, access: access.unwrap_or_default() };
-        if security.access.needs_certificates() && !security.tls.as_ref().is_some_and(|tls| tls.mutual) {
+        if security.access.certificates && !security.tls.as_ref().is_some_and(|tls| tls.mutual) {
             // Without it no client certificate is requested, so those identities could not authenticate.
             return Err(Failure::usage(
                 "--identities: certificate_sha256 needs --client-ca, so that callers present their certificates",
@@ -113,9 +110,6 @@ pub struct ClientArgs {
 impl ClientArgs {
     /// Reads the files that the options name, or the token of the environment without a token file. `own` are the client's
     /// certificate and key; `insecure` allows sending a token without TLS.
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid.
     pub fn read(&self, own: Option<(&Path, &Path)>, insecure: bool) -> Result<Settings, Failure> {
         let (certificate, key) = own.unzip();
         let tls = self.tls_ca.as_deref().map(|ca| ClientTls::read(ca, certificate, key)).transpose()?;
@@ -147,9 +141,6 @@ pub struct CallerArgs {
 
 impl CallerArgs {
     /// As [`ClientArgs::read`].
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid.
     pub fn read(&self) -> Result<Settings, Failure> {
         self.client.read(self.tls_cert.as_deref().zip(self.tls_key.as_deref()), self.insecure)
     }

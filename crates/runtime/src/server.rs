@@ -23,9 +23,6 @@ pub const GRACE: Duration = Duration::from_secs(3);
 const LISTEN: &str = "--listen";
 
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
-///
-/// # Errors
-/// The address is malformed or unavailable.
 pub async fn bind(listen: &str) -> Result<(Incoming, SocketAddr), Failure> {
     let (listener, local) = listener(listen, LISTEN).await?;
     Ok((Incoming::new(listener, ConnectionLimits::default()), local))
@@ -61,9 +58,6 @@ pub fn builder() -> Server {
 }
 
 /// [`builder`], with TLS if there are certificates.
-///
-/// # Errors
-/// The certificates are invalid.
 pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, Failure> {
     match tls {
         Some(tls) => builder().tls_config(tls.config.clone()).map_err(unusable),
@@ -72,9 +66,6 @@ pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, Failure> {
 }
 
 /// Resolves `host:port`.
-///
-/// # Errors
-/// Wrong usage: the address is malformed or unknown.
 pub fn resolve(listen: &str) -> Result<SocketAddr, Failure> {
     resolve_for(listen, LISTEN).map_err(Failure::usage)
 }
@@ -117,9 +108,6 @@ pub(crate) async fn within<T>(
 }
 
 /// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set and for health.
-///
-/// # Errors
-/// The descriptors cannot be decoded.
 pub fn with_reflection(
     router: Router,
     descriptors: &'static [u8],

@@ -50,9 +50,6 @@ pub struct Context {
 
 impl Context {
     /// Binds the service's address.
-    ///
-    /// # Errors
-    /// The address is malformed or in use.
     pub async fn listen(&mut self, listen: &str, limits: ConnectionLimits) -> Result<(Incoming, SocketAddr), Failure> {
         let (incoming, address) = server::bind(listen).await?;
         self.address = Some(address);

@@ -14,9 +14,6 @@ pub struct ServerTls {
 
 impl ServerTls {
     /// Reads the server's certificate chain and key; with `client_ca`, every client must present a certificate of that CA.
-    ///
-    /// # Errors
-    /// Wrong usage: a file cannot be read.
     pub fn read(certificate: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Self, Failure> {
         let config = ServerTlsConfig::new().identity(Identity::from_pem(read(certificate)?, read(key)?));
         let config = match client_ca {

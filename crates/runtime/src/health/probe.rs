@@ -38,9 +38,6 @@ fn unhealthy(problem: String) -> Failure {
 }
 
 /// [`ask`] on its own runtime. Returns the exit code.
-///
-/// # Errors
-/// As [`ask`].
 pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -50,18 +47,12 @@ pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> 
 }
 
 /// Checks the service that was started on this machine with these options.
-///
-/// # Errors
-/// As [`run`].
 pub fn own(listen: &str, secure: bool) -> Result<u8, Failure> {
     let scheme = if secure { "https" } else { "http" };
     run(&format!("{scheme}://{}", reachable(listen)), "", DEADLINE)
 }
 
-/// Checks the HTTP server of the program that was started on this machine with these options.
-///
-/// # Errors
-/// As [`run`]; a missing address is wrong usage.
+/// Checks the HTTP server of the program that was started on this machine with these options. A missing address is wrong usage.
 pub fn own_page(listen: Option<&str>) -> Result<u8, Failure> {
     let listen = listen.ok_or_else(|| {
         Failure::usage("--health-check: needs the address of the HTTP server; set --http or MAGEX_HTTP")

@@ -48,8 +48,8 @@ pub struct Caller {
 pub struct Access {
     /// By SHA-256, lower-case hex. `None`: every caller that passes TLS is an admin.
     known: Option<HashMap<String, Caller>>,
-    /// At least one identity is known by its certificate.
-    certificates: bool,
+    /// At least one identity is known by its certificate, so the server must request client certificates.
+    pub(crate) certificates: bool,
 }
 
 #[derive(Deserialize)]
@@ -70,9 +70,6 @@ struct Identity {
 
 impl Access {
     /// Reads a file of identities.
-    ///
-    /// # Errors
-    /// Wrong usage: the file cannot be read, or an identity is invalid.
     pub fn read(path: &Path) -> Result<Self, Failure> {
         let text = std::fs::read_to_string(path).map_err(|error| error.to_string());
         let access = text.and_then(|text| Self::parse(&text));
@@ -113,11 +110,6 @@ impl Access {
         self.known.is_some()
     }
 
-    /// At least one identity is known by its certificate, so the server must request client certificates.
-    pub fn needs_certificates(&self) -> bool {
-        self.certificates
-    }
-
     /// Authenticates a call by its `authorization` header, or else by its client certificate.
     ///
     /// # Errors
@@ -155,9 +147,7 @@ impl Access {
 }
 
 /// The authenticated caller of a request, if its role is among `allowed`. Admins are always allowed.
-///
-/// # Errors
-/// PERMISSION_DENIED: the caller has another role.
+/// Another role is rejected with PERMISSION_DENIED.
 pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
     let Some(caller) = request.extensions().get::<Caller>() else {
         return Err(Status::internal("the call was not authenticated"));

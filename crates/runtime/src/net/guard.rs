@@ -9,7 +9,7 @@ use crate::net::call_metrics::Calls;
 use crate::net::connections::Connections;
 use crate::net::deadline::{self, Deadline};
 use crate::net::in_flight::{CallKind, InFlight, Permit};
-use http_body::{Frame, SizeHint};
+use http_body::Frame;
 use http_body_util::BodyExt as _;
 use std::convert::Infallible;
 use std::future::Future;
@@ -265,14 +265,6 @@ impl http_body::Body for Metered {
             _ => {}
         }
         next
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 

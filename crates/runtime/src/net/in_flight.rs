@@ -83,9 +83,6 @@ impl InFlight {
     }
 
     /// Rejects calls while the service drains.
-    ///
-    /// # Errors
-    /// UNAVAILABLE.
     pub fn check_open(&self) -> Result<(), Status> {
         if self.draining.is_cancelled() { Err(stopping()) } else { Ok(()) }
     }
