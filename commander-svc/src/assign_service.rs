@@ -9,8 +9,8 @@ use crate::error::{to_status, too_late};
 use crate::metrics::CommanderMetrics;
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply};
-use magex_dispatch::mission::Planned;
-use magex_dispatch::{AssignError, Problem, answer, engine};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::{AssignError, Problem, engine};
 use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::status;
@@ -90,11 +90,7 @@ impl AssignService {
         let budget = budget.limited(problem.deadline);
         let problem = Arc::new(problem);
         let planned = self.plan(&problem, budget).await?;
-        let mut response = answer::write(&problem, &planned.plan);
-        response.fallback_reason = planned.fallback_reason;
-        if let Some((version, sha256, run)) = planned.weights {
-            (response.version, response.sha256, response.run_id) = (version, sha256, run);
-        }
+        let mut response = planned.respond(&problem);
         let elapsed = budget.elapsed();
         response.seconds = elapsed.as_secs_f64();
         self.metrics.answered(response.scheduler().into(), !response.fallback_reason.is_empty(), elapsed);

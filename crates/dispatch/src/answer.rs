@@ -5,7 +5,27 @@ use crate::engine::Plan;
 use crate::problem::Problem;
 use magex_proto::v1;
 
-/// Writes the response. The caller adds the weights, the reason of a fallback and the time.
+/// A plan and its origin.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Planned {
+    /// The plan.
+    pub plan: Plan,
+    /// Why another method than the requested one answered; empty otherwise.
+    pub fallback_reason: String,
+    /// Weights that answered: version, SHA-256, run.
+    pub weights: Option<(u32, String, String)>,
+}
+
+impl Planned {
+    /// Writes the response. The caller adds the time.
+    pub fn respond(self, problem: &Problem) -> v1::AssignResponse {
+        let fallback_reason = self.fallback_reason;
+        let (version, sha256, run_id) = self.weights.unwrap_or_default();
+        v1::AssignResponse { fallback_reason, version, sha256, run_id, ..write(problem, &self.plan) }
+    }
+}
+
+/// Writes the response without the weights and the reason of a fallback.
 pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     let (n, g) = (problem.agent_count, problem.goal_count);
     let mut response = v1::AssignResponse {

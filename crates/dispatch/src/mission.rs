@@ -4,9 +4,9 @@
 mod changes;
 mod members;
 
-use crate::engine::Plan;
+use crate::answer::Planned;
 use crate::problem::{Problem, pairs, priced_pairs, switching_cost};
-use crate::{AssignError, UNASSIGNED, answer};
+use crate::{AssignError, UNASSIGNED};
 use changes::sentence;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
@@ -28,17 +28,6 @@ pub struct MissionLimits {
     pub members: usize,
     /// Lifetime without an update, milliseconds.
     pub lifetime_ms: i64,
-}
-
-/// A plan and its origin.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Planned {
-    /// The plan.
-    pub plan: Plan,
-    /// Why another method than the requested one answered; empty otherwise.
-    pub fallback_reason: String,
-    /// Weights that answered: version, SHA-256, run.
-    pub weights: Option<(u32, String, String)>,
 }
 
 /// Solves a problem with the available methods.
@@ -298,41 +287,41 @@ impl Mission {
     fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), AssignError> {
         let before = self.assignment.pairs.clone();
         let solved = match self.problem() {
-            Some((problem, agents, goals)) => Some((planner(&problem)?, problem, agents, goals)),
+            Some((problem, agents, goals)) => Some((planner(&problem)?.respond(&problem), agents, goals)),
             None => None,
         };
         let a = &mut self.assignment;
         a.revision += 1;
         a.updated_ms = now;
         a.expires_ms = now.saturating_add(self.lifetime_ms);
-        (a.pairs, a.cost, a.largest_cost) = (Vec::new(), 0.0, 0.0);
-        (a.exact_cost, a.gap, a.saving) = (Some(0.0), Some(0.0), None);
-        a.answered_by = a.scheduler;
-        (a.fallback_reason, a.version, a.sha256, a.run_id) = Default::default();
-        let (mut idle_agents, mut idle_goals) = (BTreeMap::new(), BTreeMap::new());
-        if let Some((planned, problem, agents, goals)) = &solved {
-            let response = answer::write(problem, &planned.plan);
-            (a.cost, a.largest_cost) = (response.cost, response.largest_cost);
-            (a.exact_cost, a.gap) = (response.exact_cost, response.gap);
-            a.answered_by = response.scheduler;
-            a.fallback_reason.clone_from(&planned.fallback_reason);
-            if let Some((version, sha256, run)) = planned.weights.clone() {
-                (a.version, a.sha256, a.run_id) = (version, sha256, run);
+        let mut reasons = None;
+        let response = match solved {
+            Some((mut response, agents, goals)) => {
+                for pair in &mut response.pairs {
+                    let (agent, goal) = (agents[pair.agent_index as usize], goals[pair.goal_index as usize]);
+                    (pair.agent_index, pair.goal_index) = (agent as u32, goal as u32);
+                    (pair.agent_id, pair.goal_id) = (a.agents[agent].id.clone(), a.goals[goal].id.clone());
+                }
+                let placed = |left: &[v1::Unassigned], places: &[usize]| -> BTreeMap<usize, i32> {
+                    left.iter().map(|member| (places[member.index as usize], member.reason)).collect()
+                };
+                let (agents, goals) =
+                    (placed(&response.agents_without_goal, &agents), placed(&response.goals_without_agent, &goals));
+                reasons = Some((agents, goals));
+                response
             }
-            for mut pair in response.pairs {
-                let (agent, goal) = (agents[pair.agent_index as usize], goals[pair.goal_index as usize]);
-                (pair.agent_index, pair.goal_index) = (agent as u32, goal as u32);
-                (pair.agent_id, pair.goal_id) = (a.agents[agent].id.clone(), a.goals[goal].id.clone());
-                a.pairs.push(pair);
+            None => {
+                let (exact_cost, scheduler) = (Some(0.0), a.scheduler);
+                v1::AssignResponse { exact_cost, gap: exact_cost, scheduler, ..Default::default() }
             }
-            idle_agents = response.agents_without_goal.iter().map(|u| (agents[u.index as usize], u.reason)).collect();
-            idle_goals = response.goals_without_agent.iter().map(|u| (goals[u.index as usize], u.reason)).collect();
-        }
-        let paired = |side: fn(&v1::Pair) -> u32, pairs: &[v1::Pair]| -> BTreeSet<usize> {
-            pairs.iter().map(|pair| side(pair) as usize).collect()
         };
-        a.agents_without_goal = idle(&a.agents, &paired(|p| p.agent_index, &a.pairs), &idle_agents);
-        a.goals_without_agent = idle(&a.goals, &paired(|p| p.goal_index, &a.pairs), &idle_goals);
+        (a.pairs, a.cost, a.largest_cost) = (response.pairs, response.cost, response.largest_cost);
+        (a.exact_cost, a.gap, a.answered_by) = (response.exact_cost, response.gap, response.scheduler);
+        a.fallback_reason = response.fallback_reason;
+        (a.version, a.sha256, a.run_id) = (response.version, response.sha256, response.run_id);
+        let (agents, goals) = reasons.unzip();
+        a.agents_without_goal = idle(&a.agents, agents.as_ref());
+        a.goals_without_agent = idle(&a.goals, goals.as_ref());
         self.explain(&before, removed);
         Ok(())
     }
@@ -351,10 +340,7 @@ impl Mission {
     /// Fills in the changes against `before`, with their reasons.
     fn explain(&mut self, before: &[v1::Pair], removed: &Removed) {
         let a = &self.assignment;
-        let member = |members: &[v1::Member]| -> HashMap<String, v1::Member> {
-            members.iter().map(|m| (m.id.clone(), m.clone())).collect()
-        };
-        let (agents, goals) = (member(&a.agents), member(&a.goals));
+        let (agents, goals) = (by_id(&a.agents), by_id(&a.goals));
         let cost = |agent: &str, goal: &str| self.cost_of(agents.get(agent)?, goals.get(goal)?);
         let old: BTreeMap<&str, &str> = before.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
         let new: BTreeMap<&str, &str> = a.pairs.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
@@ -367,7 +353,7 @@ impl Mission {
             if from == to {
                 continue;
             }
-            let state = |members: &HashMap<String, v1::Member>, id: &str| members.get(id).map(v1::Member::state);
+            let state = |members: &HashMap<&str, &v1::Member>, id: &str| members.get(id).map(|member| member.state());
             let gone = |removed: &[String], id: &str| removed.iter().any(|other| other == id);
             let reason = match (from, state(&agents, agent)) {
                 (None, _) => v1::ChangeReason::Assigned,
@@ -408,17 +394,20 @@ struct Removed {
     goals: Vec<String>,
 }
 
-/// Members without a partner: inactive ones, and those that the plan left unassigned. If a side is empty, the other one
-/// outnumbers it.
-fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usize, i32>) -> Vec<v1::Unassigned> {
-    let without = members.iter().enumerate().filter(|(k, _)| !paired.contains(k));
-    without
-        .map(|(k, member)| {
-            let reason = match member.state() {
-                v1::MemberState::Active => reasons.get(&k).copied().unwrap_or(v1::UnassignedReason::Outnumbered.into()),
-                _ => v1::UnassignedReason::Inactive.into(),
-            };
-            v1::Unassigned { index: k as u32, id: member.id.clone(), reason }
-        })
-        .collect()
+fn by_id(members: &[v1::Member]) -> HashMap<&str, &v1::Member> {
+    members.iter().map(|member| (member.id.as_str(), member)).collect()
+}
+
+/// Members without a partner: inactive ones, and those that the plan left unassigned, with its `reasons`. Without a plan a side is
+/// empty, so that the other one outnumbers it.
+fn idle(members: &[v1::Member], reasons: Option<&BTreeMap<usize, i32>>) -> Vec<v1::Unassigned> {
+    let idle = |(k, member): (usize, &v1::Member)| {
+        let reason = match (member.state(), reasons) {
+            (v1::MemberState::Active, Some(reasons)) => *reasons.get(&k)?,
+            (v1::MemberState::Active, None) => v1::UnassignedReason::Outnumbered.into(),
+            _ => v1::UnassignedReason::Inactive.into(),
+        };
+        Some(v1::Unassigned { index: k as u32, id: member.id.clone(), reason })
+    };
+    members.iter().enumerate().filter_map(idle).collect()
 }

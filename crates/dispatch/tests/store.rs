@@ -4,7 +4,8 @@
 
 use magex_dispatch::disk::{Disk, DiskError, PAUSE};
 use magex_dispatch::engine;
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::missions::{Bounds, KeepError, Missions};
 use magex_dispatch::{AssignError, Problem};
 use magex_proto::v1;

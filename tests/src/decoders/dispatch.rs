@@ -1,6 +1,7 @@
 //! Requests and missions, up to the answer.
 
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::{AssignError, Limits, Problem, answer, engine};
 use magex_proto::v1::{AssignRequest, AssignResponse, CreateMissionRequest, UpdateMissionRequest};
 use prost::Message as _;
