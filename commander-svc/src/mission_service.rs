@@ -171,8 +171,7 @@ impl MissionService {
         Ok(v1::ListAssignmentsResponse { assignments, next_page_token })
     }
 
-    /// Up to `count` assignments after this name, by name, within [`PAGE_BYTES`] (but at least one); and whether there are
-    /// more.
+    /// Up to `count` assignments after this name, by name, within [`PAGE_BYTES`] (but at least one); whether there are more.
     pub(crate) fn after(
         &self,
         caller: &Caller,

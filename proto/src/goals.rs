@@ -74,8 +74,7 @@ pub struct WeightsKey {
     pub sha256: String,
 }
 
-/// The teams of one shard. Random choices are keyed by (seed, shard), so that the reply is a pure function of the request and
-/// the weights that `shard.version` names.
+/// The teams of one shard. The reply is a pure function of it and of the weights that `shard.version` names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GoalRequest {
     /// The shard: kind, iteration, index, set and first episode are keys; version and mode are instructions.

@@ -1,5 +1,4 @@
-//! The bottleneck assignment: minimise the largest cost instead of the sum (the time at which the last agent arrives,
-//! if all fly at the same speed).
+//! The bottleneck assignment: minimise the largest cost (when the last agent arrives, if all fly at the same speed).
 //!
 //! Binary search over the sorted costs with Hopcroft & Karp's maximum matching (1973) on the pairs up to the threshold;
 //! among the assignments with the smallest largest cost, the one with the smallest sum.
@@ -19,9 +18,8 @@ pub struct BottleneckSolver {
 }
 
 impl BottleneckSolver {
-    /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where a cost of +∞ forbids a pair; among those the smallest
-    /// largest cost, and among those the smallest sum. Stops as soon as `should_continue` returns false.
-    /// Fails as [`Solver::solve_allowed`].
+    /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where +∞ forbids a pair; among those the smallest largest
+    /// cost, then the smallest sum. Stops as soon as `should_continue` returns false. Fails as [`Solver::solve_allowed`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],

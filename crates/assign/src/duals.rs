@@ -126,8 +126,7 @@ impl Sinkhorn {
         Self { shape: (rows, cols), by_row, by_col, best }
     }
 
-    /// Scales the rows to sum 1, then the columns to rows / cols; how far the columns were from that. `correct` turns
-    /// (scale, wanted sum / present sum) into the new scale.
+    /// Scales the rows to sum 1, then the columns to rows / cols; returns how far they were from that.
     #[inline(always)]
     fn round(
         by_row: &mut Side,
@@ -141,8 +140,7 @@ impl Sinkhorn {
         rescale(&mut by_row.scale, &mut by_row.sum, cols, rows as f32 / cols as f32, correct)
     }
 
-    /// One ε: the kernel from the current potentials, rounds of scaling until the columns are within [`TOLERANCE`] of
-    /// their mass or there were `rounds`, absorption.
+    /// One ε: the kernel, rounds of scaling until the columns are within [`TOLERANCE`] of their mass, absorption.
     fn stage(&mut self, epsilon: f32, rounds: usize) {
         let Self { shape, by_row, by_col, best } = self;
         let shape @ (rows, cols) = *shape;
@@ -303,8 +301,7 @@ fn exp(x: f32) -> f32 {
     p * f32::from_bits(exponent)
 }
 
-/// Natural logarithm of a positive normal number, absolute error below 4e-7 near 1: x = m · 2^n with m in
-/// [√½, √2), ln m = 2 artanh((m − 1) / (m + 1)).
+/// ln of a positive normal number, absolute error below 4e-7 near 1: x = m · 2^n, ln m = 2 artanh((m − 1) / (m + 1)).
 fn ln(x: f32) -> f32 {
     let bits = x.to_bits();
     // 0x3f3504f3 is √½; subtracting it makes the exponent field count from there.

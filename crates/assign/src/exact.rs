@@ -1,9 +1,8 @@
 //! The minimum-cost assignment, rectangular, in f64.
 //!
-//! Jonker & Volgenant 1987: column reduction, reduction transfer, one pass of augmenting row reduction (a second one
-//! costs more than it saves), then shortest augmenting paths (dense Dijkstra on reduced costs). With fewer rows than
-//! columns the column reduction is left out: a column that stays alone must keep the price 0, and only columns with a
-//! partner are ever repriced afterwards.
+//! Jonker & Volgenant 1987: column reduction, reduction transfer, one pass of augmenting row reduction (a second costs more
+//! than it saves), then shortest augmenting paths (dense Dijkstra). With fewer rows than columns the column reduction is left
+//! out: a column that stays alone must keep the price 0, and only columns with a partner are repriced later.
 //!
 //! Floating point: row prices are never stored (they follow from the matched entry), a repricing that rounds to nothing
 //! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
@@ -38,7 +37,6 @@ pub struct Solver {
     col_of_row: Vec<u32>,
     free: Vec<u32>,
     still_free: Vec<u32>,
-    points: Vec<f64>,
     shortlists: Shortlists,
     /// Columns from which on there are shortlists, if not the usual number.
     pub(crate) lists_from: Option<usize>,
@@ -61,7 +59,9 @@ struct Branch {
 /// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
 /// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
 pub fn exact_points(agents: &[f32], goals: &[f32], dims: usize) -> Result<(Vec<u32>, f64), AssignError> {
-    let answer = Solver::default().solve_points(agents, goals, dims)?;
+    let mut cost = Vec::new();
+    let (rows, cols) = distances_into(agents, goals, dims, &mut cost)?;
+    let answer = Solver::default().solve(&cost, rows, cols)?;
     Ok((answer.col_of_row, answer.cost))
 }
 
@@ -124,15 +124,6 @@ impl Solver {
         }
         let cost = cost_of(cost, cols, &col_of_row);
         Ok(Assignment { col_of_row, cost })
-    }
-
-    /// [`exact_points`] with this solver's memory.
-    pub fn solve_points(&mut self, agents: &[f32], goals: &[f32], dims: usize) -> Result<Assignment, AssignError> {
-        let mut points = std::mem::take(&mut self.points);
-        let answer =
-            distances_into(agents, goals, dims, &mut points).and_then(|(rows, cols)| self.solve(&points, rows, cols));
-        self.points = points;
-        answer
     }
 
     fn run(
@@ -251,8 +242,7 @@ impl Solver {
         cols >= self.lists_from.unwrap_or(WORTH_IT)
     }
 
-    /// Finds the shortest alternating path from a free row to a free column, reprices the columns of the tree and
-    /// flips the path.
+    /// Finds the shortest alternating path from a free row to a free column, reprices the tree and flips the path.
     fn augment(&mut self, cost: &[f64], cols: usize, start: u32) {
         let listed = self.listed(cols);
         let Self { stride, price, open_price, distance, tree, row_of_col, col_of_row, shortlists, unread, .. } = self;

@@ -126,8 +126,7 @@ pub(crate) struct Span {
 }
 
 impl Span {
-    /// A price for forbidden pairs, so high that one of them costs more than any `pairs` others could save. Low enough
-    /// that the others keep their digits.
+    /// A price of forbidden pairs, above all that others could save, and so low that the others keep their digits.
     pub(crate) fn penalty(&self, pairs: usize) -> f64 {
         if self.least > self.largest {
             return 1.0;
@@ -207,8 +206,7 @@ fn invalid_size(field: &str, found: usize, expected: usize) -> AssignError {
     AssignError::invalid(field, format!("{found} numbers, the shape asks for {expected}"))
 }
 
-/// Distances `[rows, cols]` in f64 between f32 points into a buffer that is reused: agents `[rows, dims]`, goals `[cols, dims]`.
-/// Returns (rows, cols).
+/// Distances `[rows, cols]` in f64 between agents `[rows, dims]` and goals `[cols, dims]`; returns (rows, cols).
 ///
 /// # Errors
 /// Empty or ragged arrays and coordinates that are not finite.

@@ -4,8 +4,7 @@ use crate::bottleneck::Matcher;
 use crate::{AssignError, UNASSIGNED, check_allowed, check_shape};
 use magex_core::rng::Stream;
 
-/// A uniformly random matching of min(rows, cols) pairs: the column of each row, or [`UNASSIGNED`].
-/// Fails without rows or columns.
+/// A uniformly random matching of min(rows, cols) pairs: the column of each row. Fails without rows or columns.
 pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>, AssignError> {
     check_shape(rows, cols)?;
     let mut col_of_row = stream.permutation(rows.max(cols));

@@ -174,8 +174,7 @@ fn prepare(database: &Database) -> Result<(), DiskError> {
     Ok(())
 }
 
-/// Makes the file equal to `kept`: removes a change that failed but was written, and restores every acknowledged mission even
-/// if the file was deleted.
+/// Makes the file equal to `kept`: removes a change that failed but was written, and restores acknowledged missions.
 fn mirror(database: &Database, kept: &Kept) -> Result<(), DiskError> {
     let (mut same, mut unknown) = (HashSet::new(), Vec::new());
     {

@@ -36,6 +36,9 @@ pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, AssignError> + 'a;
 /// Names of an agent and of a goal.
 type Names = (String, String);
 
+/// Names of the agents and of the goals that an update removed.
+type Removed = [Vec<String>; 2];
+
 /// A mission and its current assignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mission {
@@ -113,8 +116,7 @@ impl Mission {
         empty.change("forbidden", content, now, limits, planner)
     }
 
-    /// Computes and plans the next revision; this one is unchanged.
-    /// An error names the first invalid field, or is the planner's.
+    /// Computes and plans the next revision. An error names the first invalid field, or is the planner's.
     pub fn update(
         &self,
         request: v1::UpdateMissionRequest,
@@ -147,7 +149,8 @@ impl Mission {
                 ("clear_cost_overrides", request.clear_cost_overrides.len()),
             ],
         )?;
-        let removed = self.remove(&request.remove_agents, &request.remove_goals)?;
+        let removed = [request.remove_agents, request.remove_goals];
+        self.remove(&removed)?;
         self.upsert(request.agents, request.goals, limits)?;
         let known = MemberNames::of(&self.assignment);
         let names = |pair: &v1::PairRef| known.names(pair);
@@ -222,7 +225,7 @@ impl Mission {
         Ok(())
     }
 
-    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Removed, AssignError> {
+    fn remove(&mut self, [agents, goals]: &Removed) -> Result<(), AssignError> {
         let a = &mut self.assignment;
         for (field, members, ids) in [("remove_agents", &mut a.agents, agents), ("remove_goals", &mut a.goals, goals)] {
             let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
@@ -232,11 +235,10 @@ impl Mission {
             let ids: HashSet<&str> = ids.iter().map(String::as_str).collect();
             members.retain(|member| !ids.contains(member.id.as_str()));
         }
-        let removed = Removed { agents: agents.to_vec(), goals: goals.to_vec() };
         let (agents, goals): (HashSet<&String>, HashSet<&String>) = (agents.iter().collect(), goals.iter().collect());
         self.forbidden.retain(|(agent, goal)| !agents.contains(agent) && !goals.contains(goal));
         self.overrides.retain(|(agent, goal), _| !agents.contains(agent) && !goals.contains(goal));
-        Ok(removed)
+        Ok(())
     }
 
     fn check_size(&self, limits: &MissionLimits) -> Result<(), AssignError> {
@@ -338,7 +340,7 @@ impl Mission {
     }
 
     /// Fills in the changes against `before`, with their reasons.
-    fn explain(&mut self, before: &[v1::Pair], removed: &Removed) {
+    fn explain(&mut self, before: &[v1::Pair], [removed_agents, removed_goals]: &Removed) {
         let a = &self.assignment;
         let (agents, goals) = (by_id(&a.agents), by_id(&a.goals));
         let cost = |agent: &str, goal: &str| self.cost_of(agents.get(agent)?, goals.get(goal)?);
@@ -358,12 +360,12 @@ impl Mission {
             let reason = match (from, state(&agents, agent)) {
                 (None, _) => v1::ChangeReason::Assigned,
                 (_, None) => v1::ChangeReason::AgentRemoved,
-                _ if gone(&removed.agents, agent) => v1::ChangeReason::AgentRemoved,
+                _ if gone(removed_agents, agent) => v1::ChangeReason::AgentRemoved,
                 (_, Some(v1::MemberState::Failed)) => v1::ChangeReason::AgentFailed,
                 (_, Some(v1::MemberState::Finished)) => v1::ChangeReason::AgentFinished,
                 (Some(goal), _) => match state(&goals, goal) {
                     None => v1::ChangeReason::GoalRemoved,
-                    _ if gone(&removed.goals, goal) => v1::ChangeReason::GoalRemoved,
+                    _ if gone(removed_goals, goal) => v1::ChangeReason::GoalRemoved,
                     Some(v1::MemberState::Failed) => v1::ChangeReason::GoalFailed,
                     Some(v1::MemberState::Finished) => v1::ChangeReason::GoalFinished,
                     _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
@@ -385,13 +387,6 @@ impl Mission {
         }
         (self.assignment.changes, self.assignment.saving) = (changes, saving);
     }
-}
-
-/// Members that an update removed.
-#[derive(Debug, Default)]
-struct Removed {
-    agents: Vec<String>,
-    goals: Vec<String>,
 }
 
 fn by_id(members: &[v1::Member]) -> HashMap<&str, &v1::Member> {

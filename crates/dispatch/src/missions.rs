@@ -1,7 +1,6 @@
 //! All missions of a service, in memory and optionally on disk, bounded in number and age. Readers never wait for the disk.
 //!
-//! An update computes revision r + 1 from revision r, writes it to disk, and commits it only if r is still current (optimistic
-//! concurrency). Otherwise the caller re-plans.
+//! An update writes revision r + 1 and commits it only if r is still current; otherwise the caller re-plans.
 
 use crate::disk::{Disk, DiskError, Kept};
 use crate::mission::{Mission, MissionLimits};

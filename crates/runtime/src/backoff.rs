@@ -8,8 +8,7 @@ pub const FIRST: Duration = Duration::from_millis(100);
 /// Longest wait.
 pub const LONGEST: Duration = Duration::from_secs(5);
 
-/// Jittered exponential backoff: each wait is drawn from the upper half of a span that doubles up to [`LONGEST`].
-/// The jitter reaches no number: it only moves a retry.
+/// Each wait is drawn from the upper half of a span that doubles up to [`LONGEST`]. It reaches no number of a run.
 #[derive(Debug, Clone)]
 pub struct Backoff {
     span: Duration,

@@ -13,24 +13,8 @@ use tonic::{Request, Status};
 /// A channel whose calls carry the client's token, if it has one.
 pub type Channel = InterceptedService<transport::Channel, Bearer>;
 
-/// A URL that cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum UrlError {
-    /// It is malformed.
-    #[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
-    Form {
-        /// The URL.
-        url: String,
-        /// The problem.
-        reason: String,
-    },
-    /// The token would be sent without TLS.
-    #[error("'{0}': the token would be sent unencrypted to another machine; use https, or --insecure to allow it")]
-    Exposed(String),
-}
-
-/// A bearer token. Debug output does not show it.
-#[derive(Clone)]
+/// A bearer token. It is marked as sensitive, so that debug output does not show it.
+#[derive(Debug, Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
 impl Token {
@@ -57,13 +41,6 @@ impl Token {
     }
 }
 
-// A token must not reach a log.
-impl std::fmt::Debug for Token {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Token")
-    }
-}
-
 /// The credentials of a client and the CA that it trusts; read once for all connections.
 #[derive(Debug, Clone, Default)]
 pub struct Settings {
@@ -77,23 +54,25 @@ pub struct Settings {
 
 impl Settings {
     /// A channel that connects with the first call and reconnects after failures. Fails if the token would be sent without TLS.
-    pub fn lazy_channel(&self, url: &str) -> Result<Channel, UrlError> {
+    pub fn lazy_channel(&self, url: &str) -> Result<Channel, Failure> {
         let (endpoint, bearer) = self.endpoint(url)?;
         Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
     }
 
     /// A connected channel. Wrong usage has the exit code of [`Failure::usage`], a failed connection [`exit::UNAVAILABLE`].
     pub async fn connect(&self, url: &str) -> Result<Channel, Failure> {
-        let (endpoint, bearer) = self.endpoint(url).map_err(Failure::usage)?;
+        let (endpoint, bearer) = self.endpoint(url)?;
         let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
         Ok(InterceptedService::new(channel, bearer))
     }
 
-    fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), UrlError> {
+    fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), Failure> {
         let endpoint = endpoint_with(url, self.tls.as_ref())?;
         let encrypted = endpoint.uri().scheme_str() == Some("https");
         if self.token.is_some() && !encrypted && !self.insecure && !is_local(endpoint.uri().host()) {
-            return Err(UrlError::Exposed(url.to_owned()));
+            return Err(Failure::usage(format!(
+                "'{url}': the token would be sent unencrypted to another machine; use https, or --insecure to allow it"
+            )));
         }
         Ok((endpoint, Bearer(self.token.clone())))
     }
@@ -128,7 +107,7 @@ impl Interceptor for Bearer {
 }
 
 /// An endpoint with our settings, without certificates.
-pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
+pub fn endpoint(url: &str) -> Result<Endpoint, Failure> {
     endpoint_with(url, None)
 }
 
@@ -136,13 +115,15 @@ pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
 pub fn endpoint_from_env(url: &str) -> Result<Endpoint, Failure> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
     let tls = secure.then(ClientTls::from_env).transpose()?;
-    endpoint_with(url, tls.as_ref()).map_err(Failure::usage)
+    endpoint_with(url, tls.as_ref())
 }
 
-/// An endpoint with our settings: a dead peer is detected within 15 s, even on an idle connection. Certificates apply to https
-/// only.
-pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
-    let wrong = |reason: String| UrlError::Form { url: url.to_owned(), reason };
+/// An endpoint that detects a dead peer within 15 s, even on an idle connection. Certificates apply to https only.
+pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, Failure> {
+    let wrong = |reason: String| {
+        let form = "use the form http://host:port, or https://host:port";
+        Failure::usage(format!("'{url}' is not an address to connect to ({reason}): {form}"))
+    };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;
     let endpoint = match (endpoint.uri().scheme_str(), tls) {
         _ if endpoint.uri().host().is_none() => return Err(wrong("no host".to_owned())),
@@ -185,7 +166,7 @@ mod tests {
         }
         for url in ["http://10.0.0.1:1", "http://learner:1", "http://localhost.evil:1", "http://[2001:db8::1]:1"] {
             let error = settings.endpoint(url).unwrap_err();
-            assert!(matches!(error, UrlError::Exposed(_)), "{error}");
+            assert!(error.message.contains("sent unencrypted"), "{error}");
             Settings { insecure: true, ..settings.clone() }.endpoint(url).unwrap();
             Settings::default().endpoint(url).unwrap();
         }

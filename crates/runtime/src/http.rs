@@ -57,8 +57,7 @@ impl Page {
         self.address
     }
 
-    /// Serves in the background until `shutdown`, and at most [`GRACE`] longer. Errors are only logged: training does not
-    /// depend on this server.
+    /// Serves in the background until `shutdown`, and at most [`GRACE`] longer. Errors are only logged.
     pub fn serve(self, routes: Router, shutdown: CancellationToken) -> JoinHandle<()> {
         tokio::spawn(async move {
             if let Err(error) = serve(self.incoming, routes, shutdown).await {

@@ -103,8 +103,7 @@ impl Metrics {
     }
 }
 
-/// Raises a counter to `total`, for a total that is counted elsewhere. A smaller `total` changes nothing. Not atomic: callers
-/// hold a lock.
+/// Raises a counter to `total`, which is counted elsewhere and never falls. Not atomic: callers hold a lock.
 pub fn raise_to(counter: &IntCounter, total: u64) {
     counter.inc_by(total.saturating_sub(counter.get()));
 }

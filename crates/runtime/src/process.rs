@@ -10,9 +10,8 @@ const ENVIRONMENT: [(&str, &str); 4] = [
     // The tensor library must not start threads of its own.
     ("RAYON_NUM_THREADS", "1"),
     ("CANDLE_NUM_THREADS", "1"),
-    // Blocks of up to 32 MiB come from the heap, and the heap keeps up to 64 MiB free at its end: the upper end of glibc's
-    // dynamic thresholds. With the lower thresholds, each training step returns its buffers to the system and maps them
-    // again, which is three times slower.
+    // The upper end of glibc's dynamic thresholds. With lower ones, each training step returns its buffers to the system and
+    // maps them again, which is three times slower.
     ("MALLOC_MMAP_THRESHOLD_", "33554432"),
     ("MALLOC_TRIM_THRESHOLD_", "67108864"),
 ];

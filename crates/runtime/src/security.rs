@@ -52,8 +52,7 @@ impl ServerArgs {
         ConnectionLimits { total, per_peer, ..ConnectionLimits::default() }
     }
 
-    /// Reads the files that the options name. A non-loopback address needs TLS and authentication, unless `--insecure` is
-    /// given.
+    /// Reads the files of the options. A non-loopback address needs TLS and authentication, unless `--insecure` is given.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
         let access = self.identities.as_deref().map(Access::read).transpose()?;
         let tls = match (&self.tls_cert, &self.tls_key) {

@@ -68,8 +68,7 @@ impl Context {
     }
 }
 
-/// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines; traces have it with the
-/// prefix `magex-`.
+/// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines and traces.
 ///
 /// # Errors
 /// Wrong usage, a socket that cannot be bound, and what `run` returns.

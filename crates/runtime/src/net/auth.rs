@@ -146,8 +146,7 @@ impl Access {
     }
 }
 
-/// The authenticated caller of a request, if its role is among `allowed`. Admins are always allowed.
-/// Another role is rejected with PERMISSION_DENIED.
+/// The caller of a request, if its role is among `allowed` or admin; otherwise PERMISSION_DENIED.
 pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
     let Some(caller) = request.extensions().get::<Caller>() else {
         return Err(Status::internal("the call was not authenticated"));

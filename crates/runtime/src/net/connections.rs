@@ -1,5 +1,4 @@
-//! Connection table: enforces total and per-peer limits and closes connections that send no call within
-//! [`ConnectionLimits::first_call`].
+//! Connection table: limits in total and per peer, and the time to the first call ([`ConnectionLimits::first_call`]).
 //!
 //! A connection is `Silent` until its first call, `Probed` after a call to a public service (health, reflection, the HTTP
 //! page), and `Called` after an authenticated call. A `Silent` connection is closed after `first_call`, handshakes included.

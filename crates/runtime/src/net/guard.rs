@@ -1,6 +1,5 @@
-//! The layer in front of a service: it authenticates a call, counts what the caller has in flight, counts messages while they
-//! arrive, and ends the call at its deadline. It decides from the headers of a call and the announced length of a message, before
-//! anything is decoded.
+//! The layer in front of a service: it authenticates a call, counts what the caller has in flight and what arrives, and ends
+//! the call at its deadline. It decides from headers and announced lengths, before anything is decoded.
 
 mod truncate_status;
 
