@@ -15,6 +15,7 @@ use magex_runtime::net::auth::{Role, caller};
 use magex_runtime::net::in_flight::{CallKind, InFlight};
 use magex_runtime::{status, trace};
 use std::sync::Arc;
+use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
@@ -30,7 +31,6 @@ const CLIENT: &[Role] = &[Role::Client];
 pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments"];
 
 /// Implements the service.
-#[derive(Debug)]
 pub(crate) struct CommanderApi {
     pub(crate) store: Arc<ModelStore>,
     pub(crate) answering: Arc<AssignService>,
@@ -99,7 +99,7 @@ impl CommanderService for CommanderApi {
         request: Request<Streaming<v1::AssignStreamRequest>>,
     ) -> Answer<Self::AssignStreamStream> {
         caller(&request, CLIENT)?;
-        let (answers, stream) = streams::channel();
+        let (answers, stream) = mpsc::channel(streams::AHEAD);
         let (answering, in_flight, draining) = (self.answering.clone(), self.in_flight.clone(), self.draining.clone());
         let teams = request.into_inner();
         tokio::spawn(streams::assign(answering, in_flight, self.limits, teams, answers, draining));
@@ -157,16 +157,14 @@ impl CommanderService for CommanderApi {
     ) -> Answer<Self::WatchAssignmentsStream> {
         let caller = caller(&request, CLIENT)?;
         let request = request.into_inner();
-        if request.mission_ids.len() > WATCHED {
-            let problem = format!(
-                "{} names exceed the limit of {WATCHED}; leave the list empty to watch all",
-                request.mission_ids.len()
-            );
+        let names = request.mission_ids.len();
+        if names > WATCHED {
+            let problem = format!("{names} names exceed the limit of {WATCHED}; leave the list empty to watch all");
             return Err(status::invalid_argument("mission_ids", problem));
         }
-        let source = mission_service::source("source", request.source)?;
+        let source = mission_service::source(request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
-        let (watcher, stream) = streams::channel();
+        let (watcher, stream) = mpsc::channel(streams::AHEAD);
         tokio::spawn(streams::watch(self.missions.clone(), interest, watcher, self.draining.clone()));
         Ok(Response::new(ReceiverStream::new(stream)))
     }

@@ -41,7 +41,6 @@ const UNIT: usize = 1_000_000;
 const UNITS: usize = 26;
 
 /// Answers teams.
-#[derive(Debug)]
 pub(crate) struct AssignService {
     store: Arc<ModelStore>,
     pub(crate) metrics: Arc<CommanderMetrics>,
@@ -150,7 +149,7 @@ impl AssignService {
         }
         let problem = problem.clone();
         let solving = on_thread(places, budget, move |work| solve(&problem, reason, &|| work.should_continue()));
-        let solved = tokio::time::timeout_at((budget.until() + LATE).into(), solving).await;
+        let solved = tokio::time::timeout_at((budget.until + LATE).into(), solving).await;
         solved.map_err(|_| too_late())??.map_err(to_status)
     }
 

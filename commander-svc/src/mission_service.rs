@@ -40,7 +40,6 @@ pub(crate) enum Event {
 }
 
 /// All missions, and the channel to their watchers.
-#[derive(Debug)]
 pub(crate) struct MissionService {
     pub(crate) missions: Missions,
     training: TrainingView,
@@ -77,7 +76,7 @@ impl MissionService {
             own.missions.check_room(&caller.name).map_err(to_status)?;
             let (now, each) = (now_ms(), own.missions.bounds().each);
             let drawn = format!("m-{:016x}", random_id());
-            let planner = |problem: &Problem| own.plan(problem, work);
+            let planner = own.planner(work);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(to_status)?;
             check(work)?;
             own.change(v1::WatchKind::Changed, || own.missions.insert(mission)).map_err(to_status)
@@ -125,8 +124,7 @@ impl MissionService {
                 return Ok(None);
             }
             let (each, again) = (own.missions.bounds().each, request.expected_revision.is_none() && !last);
-            let planner = |problem: &Problem| own.plan(problem, work);
-            let next = before.update(request, now_ms(), &each, &planner).map_err(to_status)?;
+            let next = before.update(request, now_ms(), &each, &own.planner(work)).map_err(to_status)?;
             check(work)?;
             match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
                 Err(KeepError::Changed { .. }) if again => Ok(None),
@@ -160,7 +158,7 @@ impl MissionService {
         caller: &Caller,
         request: &v1::ListAssignmentsRequest,
     ) -> Result<v1::ListAssignmentsResponse, Status> {
-        let source = source("source", request.source)?;
+        let source = source(request.source)?;
         let size = match request.page_size as usize {
             0 => PAGE,
             size => size.min(LONGEST_PAGE),
@@ -181,13 +179,10 @@ impl MissionService {
     ) -> (Vec<v1::Assignment>, bool) {
         let now = now_ms();
         // One more tells whether there is another page.
-        let (mut missions, mut episodes) = (Vec::new(), Vec::new());
-        if passes(filter, v1::MissionSource::Client) {
-            missions = self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
-        }
-        if passes(filter, v1::MissionSource::Training) {
-            episodes = self.training.page(name, count + 1, now);
-        }
+        let missions = || self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
+        let missions = passes(filter, v1::MissionSource::Client).then(missions).unwrap_or_default();
+        let episodes = || self.training.page(name, count + 1, now);
+        let episodes = passes(filter, v1::MissionSource::Training).then(episodes).unwrap_or_default();
         let (mut missions, mut episodes) = (missions.iter().peekable(), episodes.iter().peekable());
         let (mut found, mut bytes) = (Vec::new(), 0);
         loop {
@@ -253,8 +248,8 @@ impl MissionService {
         self.cells(before.size(), (request.agents.len(), request.goals.len()), learned)
     }
 
-    fn plan(&self, problem: &Problem, work: &Work) -> Result<Planned, AssignError> {
-        self.answering.plan_here(problem, work.budget.learned(), &|| work.should_continue())
+    fn planner(&self, work: &Work) -> impl Fn(&Problem) -> Result<Planned, AssignError> {
+        move |problem| self.answering.plan_here(problem, work.budget.learned(), &|| work.should_continue())
     }
 
     /// A mission that this caller may change.
@@ -305,9 +300,9 @@ pub(crate) fn visible(caller: &Caller, mission: &Mission, now: i64) -> bool {
     own && mission.assignment.expires_ms > now
 }
 
-pub(crate) fn source(field: &str, value: i32) -> Result<v1::MissionSource, Status> {
+pub(crate) fn source(value: i32) -> Result<v1::MissionSource, Status> {
     v1::MissionSource::try_from(value)
-        .map_err(|_| status::invalid_argument(field, format!("{value} is not a source; use client or training")))
+        .map_err(|_| status::invalid_argument("source", format!("{value} is not a source; use client or training")))
 }
 
 fn missing(id: &str) -> Status {

@@ -29,7 +29,6 @@ const RUN_ID: usize = 128;
 const SHA256: usize = 64;
 
 /// Answers shards.
-#[derive(Debug)]
 pub(crate) struct ShardAssign {
     store: Arc<ModelStore>,
     answering: Arc<AssignService>,

@@ -20,7 +20,7 @@ use tonic::{Status, Streaming};
 use tonic_types::StatusExt as _;
 
 /// Capacity of the queue of answers to a client.
-const AHEAD: usize = 2;
+pub(crate) const AHEAD: usize = 2;
 /// A client that does not read for this time loses its stream.
 const READ_TIMEOUT: Duration = Duration::from_secs(60);
 /// Assignments of a snapshot that are fetched together.
@@ -193,9 +193,4 @@ async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut Sent, event:
 async fn send(watcher: &Watcher, kind: v1::WatchKind, assignment: Option<v1::Assignment>) -> Option<()> {
     let message = v1::WatchAssignmentsResponse { kind: kind.into(), assignment };
     watcher.send_timeout(Ok(message), READ_TIMEOUT).await.ok()
-}
-
-/// A channel of answers to a client.
-pub(crate) fn channel<T>() -> (mpsc::Sender<T>, mpsc::Receiver<T>) {
-    mpsc::channel(AHEAD)
 }
