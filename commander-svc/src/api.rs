@@ -80,11 +80,11 @@ impl CommanderService for CommanderApi {
             let problem = format!("{} teams; send 1 to {}", teams.len(), self.limits.teams);
             return Err(status::invalid_argument("teams", problem));
         }
-        let mut problems = Vec::with_capacity(teams.len());
-        for (k, team) in teams.into_iter().enumerate() {
+        let read = |(k, team)| {
             let problem = Problem::read(team, self.answering.seed(), &self.limits);
-            problems.push(problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))?);
-        }
+            problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))
+        };
+        let problems: Vec<Problem> = teams.into_iter().enumerate().map(read).collect::<Result<_, _>>()?;
         let mut answers = Vec::with_capacity(problems.len());
         for problem in problems {
             answers.push(self.answering.respond(problem, budget).await?);

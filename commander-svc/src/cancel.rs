@@ -5,9 +5,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 /// Runs the work of a call on a thread that may block, and drops `held` when it has finished, even if the call has ended.
-///
-/// # Errors
-/// INTERNAL: the work panicked.
+/// INTERNAL: it panicked.
 pub(crate) async fn on_thread<T: Send + 'static>(
     held: impl Send + 'static,
     budget: CallBudget,

@@ -74,7 +74,7 @@ impl MissionService {
         let (own, places) = (self.clone(), self.answering.places(cells, budget.left()).await?);
         on_thread(places, budget, move |work| {
             own.missions.check_room(&caller.name).map_err(to_status)?;
-            let (now, each) = (now_ms(), own.missions.bounds().each);
+            let (now, each) = (now_ms(), own.missions.bounds.each);
             let drawn = format!("m-{:016x}", random_id());
             let planner = own.planner(work);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(to_status)?;
@@ -123,7 +123,7 @@ impl MissionService {
                 // It has outgrown the reserved memory.
                 return Ok(None);
             }
-            let (each, again) = (own.missions.bounds().each, request.expected_revision.is_none() && !last);
+            let (each, again) = (own.missions.bounds.each, request.expected_revision.is_none() && !last);
             let next = before.update(request, now_ms(), &each, &own.planner(work)).map_err(to_status)?;
             check(work)?;
             match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
@@ -237,7 +237,7 @@ impl MissionService {
 
     /// Upper bound of the pairs that a scheduler sees in a mission of (agents, goals) after `more` are added.
     fn cells(&self, (agents, goals): (usize, usize), more: (usize, usize), learned: bool) -> usize {
-        let most = self.missions.bounds().each.members;
+        let most = self.missions.bounds.each.members;
         let (agents, goals) = ((agents + more.0).min(most), (goals + more.1).min(most));
         // The learned scheduler pads the smaller side.
         if learned { agents.max(goals).pow(2) } else { agents * goals }

@@ -4,7 +4,6 @@ use crate::convert;
 use crate::{arrays, v1};
 use magex_core::error::FieldError;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
-use std::fmt;
 
 /// How goals are assigned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -35,12 +34,6 @@ impl AssignmentMethod {
             Self::Random => "random",
             Self::Makespan => "makespan",
         }
-    }
-}
-
-impl fmt::Display for AssignmentMethod {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
     }
 }
 
@@ -122,10 +115,7 @@ impl GoalRequest {
         }
     }
 
-    /// Reads a message: the request, and the weights that it names.
-    ///
-    /// # Errors
-    /// The first field that is invalid. Positions are finite afterwards.
+    /// Reads a message: the request, and the weights that it names. Positions are finite afterwards.
     pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), FieldError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
         let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;

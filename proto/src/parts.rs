@@ -30,10 +30,7 @@ impl Assembler {
         Self { limit, next: 0, total: 0, total_bytes: 0, buffer: Vec::new() }
     }
 
-    /// Adds the next part; the last one returns the byte string.
-    ///
-    /// # Errors
-    /// The string exceeds the limit, a part is missing or damaged, or parts disagree about the length.
+    /// Adds the next part; the last one returns the byte string. Fails beyond the limit, and if a part is missing or damaged.
     pub fn push(&mut self, part: Part) -> Result<Option<Bytes>, FieldError> {
         let taken = self.take(part);
         if !matches!(taken, Ok(None)) {

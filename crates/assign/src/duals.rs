@@ -51,9 +51,7 @@ impl Duals {
 
 /// Sinkhorn potentials of `cost`, row-major `[rows, cols]`, in the units of the cost. Row sums are 1 and column sums
 /// rows / cols. A problem whose mean |cost| is 0 has potentials 0.
-///
-/// # Errors
-/// Empty or mismatched shapes, and entries that are not finite or beyond 1e30.
+/// Fails for mismatched shapes, and entries that are not finite or beyond 1e30.
 pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize) -> Result<Duals, AssignError> {
     check_size(cost.len(), rows, cols)?;
     if let Some(place) = cost.iter().position(|value| value.is_nan() || value.abs() > 1e30) {

@@ -207,9 +207,7 @@ fn invalid_size(field: &str, found: usize, expected: usize) -> AssignError {
 }
 
 /// Distances `[rows, cols]` in f64 between agents `[rows, dims]` and goals `[cols, dims]`; returns (rows, cols).
-///
-/// # Errors
-/// Empty or ragged arrays and coordinates that are not finite.
+/// Fails for empty or ragged arrays and coordinates that are not finite.
 pub fn distances_into(
     agents: &[f32],
     goals: &[f32],

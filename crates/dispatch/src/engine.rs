@@ -68,9 +68,7 @@ fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
 }
 
 /// Solves by a method; the exact one answers in place of the learned one. `should_continue` is called from time to time.
-///
-/// # Errors
-/// [`AssignError::Interrupted`] when `should_continue` returns false.
+/// It is interrupted when that returns false.
 pub fn solve(
     problem: &Problem,
     kind: AssignmentMethod,

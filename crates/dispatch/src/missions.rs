@@ -115,7 +115,8 @@ pub struct Missions {
     kept: RwLock<Kept>,
     /// Held by a change from its check to the end of its write.
     writing: Mutex<WriteState>,
-    bounds: Bounds,
+    /// The limits.
+    pub bounds: Bounds,
 }
 
 impl Missions {
@@ -132,11 +133,6 @@ impl Missions {
     /// Number of missions.
     pub fn count(&self) -> usize {
         self.read().len()
-    }
-
-    /// The limits.
-    pub fn bounds(&self) -> &Bounds {
-        &self.bounds
     }
 
     /// The mission of this name.
@@ -156,10 +152,7 @@ impl Missions {
             .collect()
     }
 
-    /// Stores a new mission.
-    ///
-    /// # Errors
-    /// Its name is in use, a limit is reached, or the write failed.
+    /// Stores a new mission. Fails if its name is in use, a limit is reached, or the write failed.
     pub fn insert(&self, mission: Mission) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         {
@@ -188,10 +181,7 @@ impl Missions {
         Ok(())
     }
 
-    /// Stores the successor of the mission's revision `was`.
-    ///
-    /// # Errors
-    /// The mission was deleted or has another revision, or the write failed.
+    /// Stores the successor of the mission's revision `was`. Fails if it was deleted or has another one.
     pub fn replace(&self, mission: Mission, was: u64) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         // Another owner's mission of the same name must look like a missing one.
@@ -206,10 +196,7 @@ impl Missions {
         }
     }
 
-    /// Deletes a mission if `may` allows it. Check and deletion are atomic.
-    ///
-    /// # Errors
-    /// There is no such mission, or `may` returned false (the same error), or the write failed.
+    /// Deletes a mission if `may` allows it. Check and deletion are atomic. Without permission the mission seems to be missing.
     pub fn remove(&self, id: &str, may: impl FnOnce(&Mission) -> bool) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         let found = self.get(id).filter(|mission| may(mission));

@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+use magex_dispatch::answer::Planned;
 use magex_dispatch::disk::{Disk, DiskError};
 use magex_dispatch::engine;
-use magex_dispatch::answer::Planned;
 use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::missions::{Bounds, KeepError, Missions};
 use magex_dispatch::{AssignError, Problem};

@@ -2,8 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_dispatch::engine::{self, Plan};
 use magex_dispatch::answer::Planned;
+use magex_dispatch::engine::{self, Plan};
 use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::{AssignError, Limits, Problem, UNASSIGNED, answer};
 use magex_proto::goals::AssignmentMethod;

@@ -18,10 +18,7 @@ pub type Channel = InterceptedService<transport::Channel, Bearer>;
 pub struct Token(MetadataValue<Ascii>);
 
 impl Token {
-    /// A token, without surrounding whitespace; `source` names its origin in errors.
-    ///
-    /// # Errors
-    /// Wrong usage: it contains characters that a header cannot carry. The message does not contain it.
+    /// A token, without surrounding whitespace; `source` names its origin in errors. An error does not contain it.
     pub fn new(text: &str, source: &str) -> Result<Self, Failure> {
         let wrong = || Failure::usage(format!("{source}: a token is one line of printable ASCII"));
         let text = text.trim();

@@ -69,9 +69,6 @@ impl Context {
 }
 
 /// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines and traces.
-///
-/// # Errors
-/// Wrong usage, a socket that cannot be bound, and what `run` returns.
 pub fn main<T>(
     name: &'static str,
     threads: usize,

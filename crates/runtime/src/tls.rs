@@ -37,9 +37,6 @@ impl std::fmt::Debug for ClientTls {
 
 impl ClientTls {
     /// Reads the CA of the server's certificate, and the client's certificate and key.
-    ///
-    /// # Errors
-    /// Wrong usage: a file cannot be read, or a certificate has no key.
     pub fn read(ca: &Path, certificate: Option<&Path>, key: Option<&Path>) -> Result<Self, Failure> {
         let config = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read(ca)?));
         match (certificate, key) {
@@ -52,9 +49,6 @@ impl ClientTls {
     }
 
     /// Reads the files that `MAGEX_TLS_CA`, and optionally `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY`, name.
-    ///
-    /// # Errors
-    /// `MAGEX_TLS_CA` is not set, and as [`ClientTls::read`].
     pub fn from_env() -> Result<Self, Failure> {
         let path = |name: &str| std::env::var_os(name).map(PathBuf::from);
         let ca = path("MAGEX_TLS_CA")

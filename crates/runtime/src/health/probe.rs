@@ -19,9 +19,6 @@ const PAGE: u64 = 4096;
 /// Checks the service at `url` once. A URL without a path is checked over gRPC (grpc.health.v1) for `service`, or for the whole
 /// process if that is empty; https uses the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` name. A URL
 /// with a path is a page, such as http://host:port/healthz, that must answer 200.
-///
-/// # Errors
-/// Wrong usage, or the service is unhealthy.
 pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Failure> {
     let asking = async {
         match page_of(url) {

@@ -111,9 +111,7 @@ impl Access {
     }
 
     /// Authenticates a call by its `authorization` header, or else by its client certificate.
-    ///
-    /// # Errors
-    /// UNAUTHENTICATED: the credentials are missing or unknown.
+    /// Missing or unknown credentials are UNAUTHENTICATED.
     pub fn authenticate<T>(&self, request: &http::Request<T>) -> Result<Caller, Status> {
         let tls = request.extensions().get::<TlsConnectInfo<TcpConnectInfo>>();
         let certificate = tls

@@ -64,9 +64,7 @@ impl InFlight {
     }
 
     /// Counts one more call, until the permit is dropped.
-    ///
-    /// # Errors
-    /// RESOURCE_EXHAUSTED: the caller is at its limit. UNAVAILABLE: the service drains.
+    /// At the limit: RESOURCE_EXHAUSTED; while the service drains: UNAVAILABLE.
     pub fn acquire(self: &Arc<Self>, caller: &Caller, kind: CallKind) -> Result<Permit, Status> {
         self.check_open()?;
         let limit = if kind == CallKind::Call { self.limits.calls } else { self.limits.streams };
@@ -109,10 +107,7 @@ pub struct Permit {
 }
 
 impl Permit {
-    /// Counts a message of this length, which replaces the previous message of the call.
-    ///
-    /// # Errors
-    /// RESOURCE_EXHAUSTED: the bytes in flight would exceed a limit.
+    /// Counts a message of this length, which replaces the previous message of the call. Beyond a limit: RESOURCE_EXHAUSTED.
     pub fn reserve(&self, length: usize) -> Result<(), Status> {
         let mut own = lock(&self.bytes);
         let limits = &self.in_flight.limits;
