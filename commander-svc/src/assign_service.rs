@@ -56,17 +56,6 @@ pub(crate) struct AssignService {
 /// A processor, and memory.
 pub(crate) type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
 
-/// Where a team is answered.
-#[derive(Debug)]
-enum Route {
-    /// On the thread of the call.
-    Here,
-    /// On a worker thread.
-    Thread(Places),
-    /// On the thread of the call, by the exact method: no processor is free for the model.
-    ExactBecauseBusy,
-}
-
 impl AssignService {
     pub(crate) fn new(store: Arc<ModelStore>, metrics: Arc<CommanderMetrics>) -> Arc<Self> {
         let processors = Arc::new(Semaphore::new(magex_runtime::process::processors()));
@@ -96,36 +85,28 @@ impl AssignService {
         Ok(response)
     }
 
+    /// Answers a small team on the thread of the call, a large one on worker threads. The exact method answers here while no
+    /// processor is free for the model.
     async fn plan(self: &Arc<Self>, problem: &Arc<Problem>, budget: CallBudget) -> Result<Planned, Status> {
+        let (small, learned) = (problem.cells() <= SMALL, problem.scheduler == AssignmentMethod::Learned);
+        let (here, cells) = match learned {
+            true => (self.small_for_model(problem, &budget), engine::learned_cells(problem)),
+            false => (small, problem.cells()),
+        };
         let should_continue = || !budget.over();
-        let planned = match self.route(problem, &budget).await? {
-            Route::Here => self.plan_here(problem, budget.learned(), &should_continue),
-            Route::ExactBecauseBusy => {
-                solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+        let planned = if here {
+            self.plan_here(problem, budget.learned(), &should_continue)
+        } else {
+            match self.places(cells, budget.left()).await {
+                Ok(places) => return self.plan_on_thread(problem, budget, places).await,
+                Err(_) if learned && small => {
+                    solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+                }
+                Err(busy) => return Err(busy),
             }
-            Route::Thread(places) => return self.plan_on_thread(problem, budget, places).await,
         };
         let planned = planned.map_err(to_status)?;
         if budget.over() { Err(too_late()) } else { Ok(planned) }
-    }
-
-    /// Chooses where a team is answered, and waits for a worker thread if it needs one.
-    async fn route(&self, problem: &Problem, budget: &CallBudget) -> Result<Route, Status> {
-        let small = problem.cells() <= SMALL;
-        if problem.scheduler != AssignmentMethod::Learned {
-            return match small {
-                true => Ok(Route::Here),
-                false => self.places(problem.cells(), budget.left()).await.map(Route::Thread),
-            };
-        }
-        if self.small_for_model(problem, budget) {
-            return Ok(Route::Here);
-        }
-        match self.places(engine::learned_cells(problem), budget.left()).await {
-            Ok(places) => Ok(Route::Thread(places)),
-            Err(_) if small => Ok(Route::ExactBecauseBusy),
-            Err(busy) => Err(busy),
-        }
     }
 
     /// Answers on worker threads. The learned method is cancelled at its time limit.

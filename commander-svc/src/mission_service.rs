@@ -5,7 +5,7 @@ use crate::call_budget::CallBudget;
 use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
-use crate::training_view::{Episode, TrainingShard, TrainingView};
+use crate::training_view::{TrainingShard, TrainingView};
 use magex_dispatch::answer::Planned;
 use magex_dispatch::mission::Mission;
 use magex_dispatch::missions::{KeepError, Missions, passes};
@@ -188,12 +188,12 @@ impl MissionService {
         loop {
             let client_first = match (missions.peek(), episodes.peek()) {
                 (None, None) => return (found, false),
-                (Some(mission), Some(episode)) => mission.id() <= episode.name.as_str(),
+                (Some(mission), Some((name, ..))) => mission.id() <= name.as_str(),
                 (mission, _) => mission.is_some(),
             };
             let assignment = match client_first {
                 true => missions.next().map(|mission| mission.assignment.clone()),
-                false => episodes.next().and_then(Episode::assignment),
+                false => episodes.next().and_then(|(_, shard, place)| shard.assignment(*place)),
             };
             // An inconsistent episode is skipped.
             let Some(assignment) = assignment else { continue };

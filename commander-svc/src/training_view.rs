@@ -63,7 +63,7 @@ impl TrainingShard {
     }
 
     /// One stage of one episode; `None` if its arrays are inconsistent.
-    fn assignment(&self, place: usize) -> Option<v1::Assignment> {
+    pub(crate) fn assignment(&self, place: usize) -> Option<v1::Assignment> {
         let (request, reply) = (&*self.request, &*self.reply);
         let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
         let points =
@@ -129,20 +129,8 @@ impl TrainingShard {
     }
 }
 
-/// One stage of one episode of a shard.
-#[derive(Debug)]
-pub(crate) struct Episode {
-    pub(crate) name: String,
-    shard: Arc<TrainingShard>,
-    place: usize,
-}
-
-impl Episode {
-    /// As a mission.
-    pub(crate) fn assignment(&self) -> Option<v1::Assignment> {
-        self.shard.assignment(self.place)
-    }
-}
+/// One stage of one episode: its name, its shard, and its place there.
+pub(crate) type Episode = (String, Arc<TrainingShard>, usize);
 
 /// The latest shards.
 #[derive(Debug, Default)]
@@ -190,6 +178,6 @@ impl TrainingView {
         names.sort_unstable();
         names.dedup_by(|a, b| a.0 == b.0);
         names.truncate(count);
-        names.into_iter().map(|(name, k, place)| Episode { name, shard: shards[k].clone(), place }).collect()
+        names.into_iter().map(|(name, k, place)| (name, shards[k].clone(), place)).collect()
     }
 }

@@ -55,13 +55,9 @@ impl ServerArgs {
     /// Reads the files of the options. A non-loopback address needs TLS and authentication, unless `--insecure` is given.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
         let access = self.identities.as_deref().map(Access::read).transpose()?;
-        let tls = match (&self.tls_cert, &self.tls_key) {
-            (Some(certificate), Some(key)) => Some(ServerTls::read(certificate, key, self.client_ca.as_deref())?),
-            _ => None,
-        };
-        if let Some(tls) = &tls {
-            server::secure_builder(Some(tls)).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
-        }
+        let read = |(certificate, key)| ServerTls::read(certificate, key, self.client_ca.as_deref());
+        let tls = self.own().map(read).transpose()?;
+        server::secure_builder(tls.as_ref()).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
         let security = Security { tls, access: access.unwrap_or_default() };
         if security.access.certificates && !security.tls.as_ref().is_some_and(|tls| tls.mutual) {
             // Without it no client certificate is requested, so those identities could not authenticate.

@@ -110,11 +110,6 @@ impl Connections {
         &self.anonymous
     }
 
-    /// Connections that are open.
-    pub fn open(&self) -> usize {
-        lock(&self.table).open.len()
-    }
-
     /// Adds a connection; `None` at a limit when no connection can be evicted.
     fn admit(&self, address: SocketAddr) -> Option<Slot> {
         let mut table = lock(&self.table);
@@ -317,6 +312,12 @@ impl Stream for Incoming {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Connections {
+        pub(crate) fn open(&self) -> usize {
+            lock(&self.table).open.len()
+        }
+    }
 
     fn address(host: u8, port: u16) -> SocketAddr {
         ([127, 0, 0, host], port).into()
