@@ -63,13 +63,6 @@ impl BottleneckSolver {
         let cost = cost_of(cost, cols, &col_of_row);
         Ok(Assignment { col_of_row, cost })
     }
-
-    /// Gives back the memory of a problem of more than `cells` pairs.
-    pub fn forget_beyond(&mut self, cells: usize) {
-        if self.values.capacity() > cells {
-            *self = Self::default();
-        }
-    }
 }
 
 /// Hopcroft–Karp on the pairs with a cost up to a threshold.

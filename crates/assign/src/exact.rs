@@ -160,14 +160,6 @@ impl Solver {
         Ok(())
     }
 
-    /// Frees the buffers of a problem of more than `cells` pairs.
-    pub fn forget_beyond(&mut self, cells: usize) {
-        let large = self.price.len() * self.col_of_row.len() > cells;
-        if large || self.cost.capacity() > cells {
-            *self = Self::default();
-        }
-    }
-
     /// Column reduction: each column takes the price of its cheapest row, and the row itself if it is still free. Then the
     /// reduction transfer: a row chosen by one column only lowers that column's price as far as it stays its best.
     fn reduce_columns(&mut self, cost: &[f64], cols: usize) {

@@ -53,15 +53,11 @@ thread_local! {
 }
 
 /// Calls `work` with the buffers of this thread.
-fn with_workspace<T>(work: impl FnOnce(&mut Workspace) -> T) -> T {
+fn with_workspace<T>(problem: &Problem, work: impl FnOnce(&mut Workspace) -> T) -> T {
     WORKSPACE.with_borrow_mut(|workspace| {
         let done = work(workspace);
-        workspace.solver.forget_beyond(KEPT_CELLS);
-        workspace.makespan.forget_beyond(KEPT_CELLS);
-        for buffer in [&mut workspace.costs, &mut workspace.adjusted] {
-            if buffer.capacity() > KEPT_CELLS {
-                *buffer = Vec::new();
-            }
+        if problem.cells() > KEPT_CELLS {
+            *workspace = Workspace::default();
         }
         done
     })
@@ -74,7 +70,7 @@ pub fn solve(
     kind: AssignmentMethod,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Plan, AssignError> {
-    with_workspace(|workspace| {
+    with_workspace(problem, |workspace| {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         problem.costs_into(&mut workspace.costs)?;
         let sticky = workspace.adjust(problem);
@@ -109,7 +105,7 @@ pub fn adopt(
 ) -> Result<Plan, String> {
     check(problem, &goals, probabilities.as_deref())?;
     let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
-    with_workspace(|workspace| {
+    with_workspace(problem, |workspace| {
         let cols = problem.goal_count;
         problem.costs_into(&mut workspace.costs).map_err(|error| error.to_string())?;
         let costs = &workspace.costs;
