@@ -36,6 +36,14 @@ pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u
     checked(field, array, DataType::U8, shape, 1).map(|data| data.to_vec())
 }
 
+/// Numbers that must be finite; the error names the first one that is not.
+pub fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, FieldError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
+        None => Ok(values),
+    }
+}
+
 /// The shape of an array, which must have at most `axes` axes.
 pub fn shape_up_to(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;

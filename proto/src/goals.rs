@@ -1,7 +1,7 @@
 //! An actor's request to the commander for the goals of a shard, and the reply.
 
-use crate::convert;
-use crate::{arrays, v1};
+use crate::arrays::finite;
+use crate::{arrays, convert, v1};
 use magex_core::error::FieldError;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 
@@ -161,13 +161,6 @@ impl GoalReply {
             costs: finite("costs", arrays::to_f32("costs", message.costs, &problems)?)?,
             exact_costs: finite("exact_costs", arrays::to_f32("exact_costs", message.exact_costs, &problems)?)?,
         })
-    }
-}
-
-fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, FieldError> {
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
-        None => Ok(values),
     }
 }
 

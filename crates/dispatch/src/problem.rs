@@ -226,13 +226,7 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
     ConvertError::ensure(count <= limits.members, || {
         (field, format!("{count} points exceed the limit of {}", limits.members))
     })?;
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => {
-            let path = format!("{field}.coordinates[{place}]");
-            Err(ConvertError::new(path, format!("{} is not finite", values[place])))
-        }
-        None => Ok((values, dims)),
-    }
+    Ok((arrays::finite(&format!("{field}.coordinates"), values)?, dims))
 }
 
 /// Checks a cost matrix against the number of positions, if there are any. Returns its shape.
