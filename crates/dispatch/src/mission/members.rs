@@ -4,7 +4,7 @@ use super::{MissionLimits, Names, TRAINING_PREFIX};
 use crate::problem::{LONGEST_ID, check_name, finite_cost, scheduler, switching_cost};
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
-use magex_proto::v1;
+use magex_proto::{arrays, v1};
 use std::collections::{BTreeSet, HashMap, HashSet};
 
 /// Maximum number of forbidden pairs, of cost overrides, and of entries of a list in a request.
@@ -37,15 +37,13 @@ impl<'a> MemberNames<'a> {
 
     /// Resolves a pair by name: indices change when members are removed.
     pub(super) fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
-        let known = |field: &str, members: &HashSet<&str>, id: &str| match members.contains(id) {
-            true => Ok(()),
-            false if id.is_empty() => {
-                Err(ConvertError::new(field, "missing; pairs of a mission are named by id, not by index"))
-            }
-            false => Err(ConvertError::new(field, "no member has this name")),
-        };
-        known("agent_id", &self.agents, &pair.agent_id)?;
-        known("goal_id", &self.goals, &pair.goal_id)?;
+        let sides = [("agent_id", &self.agents, &pair.agent_id), ("goal_id", &self.goals, &pair.goal_id)];
+        for (field, members, id) in sides {
+            ConvertError::ensure(!id.is_empty(), || {
+                (field, "missing; pairs of a mission are named by id, not by index")
+            })?;
+            ConvertError::ensure(members.contains(id.as_str()), || (field, "no member has this name"))?;
+        }
         Ok((pair.agent_id.clone(), pair.goal_id.clone()))
     }
 }
@@ -61,44 +59,41 @@ pub(super) fn merge(
     let mut places: HashMap<String, usize> = members.iter().enumerate().map(|(k, m)| (m.id.clone(), k)).collect();
     let mut seen = BTreeSet::new();
     for (k, update) in updates.into_iter().enumerate() {
-        let wrong = |part: &str, problem: String| Err(ConvertError::new(format!("{field}[{k}].{part}"), problem));
-        check_name(&update.id, || format!("{field}[{k}].id"))?;
-        if !seen.insert(update.id.clone()) {
-            return wrong("id", "duplicate name".to_owned());
-        }
-        let Ok(state) = v1::MemberState::try_from(update.state) else {
-            return wrong("state", format!("{} is not a state; use active, failed or finished", update.state));
-        };
-        if let Some(axis) = update.position.iter().position(|x| !x.is_finite()) {
-            return wrong(&format!("position[{axis}]"), format!("{} is not finite", update.position[axis]));
-        }
-        let known = places.get(&update.id).copied();
-        if !(known.is_some() && update.position.is_empty()) {
-            if !(2..=3).contains(&update.position.len()) {
-                return wrong("position", format!("{} coordinates; give 2 or 3", update.position.len()));
-            }
-            if update.position.len() != dims {
-                let problem = format!("{} coordinates, but other members have {dims}", update.position.len());
-                return wrong("position", problem);
-            }
+        let path = |part: &str| format!("{field}[{k}].{part}");
+        check_name(&update.id, || path("id"))?;
+        ConvertError::ensure(seen.insert(update.id.clone()), || (path("id"), "duplicate name"))?;
+        let state = v1::MemberState::try_from(update.state).map_err(|_| {
+            let problem = format!("{} is not a state; use active, failed or finished", update.state);
+            ConvertError::new(path("state"), problem)
+        })?;
+        let position = arrays::finite(&path("position"), update.position)?;
+        let (known, count) = (places.get(&update.id).copied(), position.len());
+        if known.is_none() || count > 0 {
+            ConvertError::ensure((2..=3).contains(&count), || {
+                (path("position"), format!("{count} coordinates; give 2 or 3"))
+            })?;
+            ConvertError::ensure(count == dims, || {
+                (path("position"), format!("{count} coordinates, but other members have {dims}"))
+            })?;
         }
         match known {
             Some(place) => {
                 let member = &mut members[place];
-                if !update.position.is_empty() {
-                    member.position = update.position;
+                if count > 0 {
+                    member.position = position;
                 }
                 if state != v1::MemberState::Unspecified {
                     member.state = state.into();
                 }
             }
             None => {
-                if members.len() >= limits.members {
-                    return wrong("id", format!("a mission has at most {} {field}", limits.members));
-                }
+                let most = limits.members;
+                ConvertError::ensure(members.len() < most, || {
+                    (path("id"), format!("a mission has at most {most} {field}"))
+                })?;
                 let state = if state == v1::MemberState::Unspecified { v1::MemberState::Active } else { state };
                 places.insert(update.id.clone(), members.len());
-                members.push(v1::Member { state: state.into(), ..update });
+                members.push(v1::Member { id: update.id, position, state: state.into() });
             }
         }
     }
