@@ -82,12 +82,11 @@ impl TrainingShard {
         pairs(&goal_of).for_each(|(agent, goal)| pair_costs[agent] = problem.distance(agent, goal));
         let plan = Plan {
             goal_of,
-            probabilities: None,
             scheduler: self.method,
             cost: f64::from(*reply.costs.get(place)?),
             exact_cost: Some(f64::from(*reply.exact_costs.get(place)?)),
             pair_costs,
-            isolated: Default::default(),
+            ..Plan::default()
         };
         let answer = answer::write(&problem, &plan);
         let members = |ids: Vec<String>, positions: &[f32]| {

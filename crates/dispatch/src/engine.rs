@@ -21,7 +21,7 @@ pub const GAP_CELLS: usize = 1_000_000;
 const KEPT_CELLS: usize = 300_000;
 
 /// An answer: a valid matching.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
     /// `[N]` goal of each agent, or [`UNASSIGNED`].
     pub goal_of: Vec<u32>,
@@ -92,7 +92,7 @@ pub fn solve(
                 (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
             }
         };
-        workspace.finish(problem, goal_of, None, scheduler, exact_cost, should_continue)
+        workspace.finish(problem, Plan { goal_of, scheduler, exact_cost, ..Plan::default() }, should_continue)
     })
 }
 
@@ -149,7 +149,8 @@ impl Workspace {
         };
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
-        self.finish(problem, goal_of, probabilities, AssignmentMethod::Learned, None, should_continue)
+        let scheduler = AssignmentMethod::Learned;
+        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, should_continue)
     }
 
     /// Fills the adjusted costs if there are current pairs.
@@ -165,37 +166,32 @@ impl Workspace {
         true
     }
 
+    /// Fills in the costs of a matching.
     fn finish(
         &mut self,
         problem: &Problem,
-        goal_of: Vec<u32>,
-        probabilities: Option<Vec<Option<f32>>>,
-        scheduler: AssignmentMethod,
-        exact_cost: Option<f64>,
+        mut plan: Plan,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Plan, AssignError> {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         let Self { solver, costs, .. } = self;
-        let cost = cost_of(costs, cols, &goal_of);
-        let exact_cost = match exact_cost {
-            Some(exact) => Some(exact),
-            None if rows * cols <= GAP_CELLS => {
-                match solver.solve_allowed(costs, rows, cols, should_continue) {
-                    Ok(exact) => (exact.pairs().count() == pairs(&goal_of).count()).then_some(exact.cost),
-                    // The answer is complete; only its gap is missing.
-                    Err(AssignError::Interrupted) => None,
-                    Err(other) => return Err(other),
+        plan.cost = cost_of(costs, cols, &plan.goal_of);
+        if plan.exact_cost.is_none() && rows * cols <= GAP_CELLS {
+            match solver.solve_allowed(costs, rows, cols, should_continue) {
+                Ok(exact) if exact.pairs().count() == pairs(&plan.goal_of).count() => {
+                    plan.exact_cost = Some(exact.cost)
                 }
+                // The answer is complete; only its gap is missing.
+                Ok(_) | Err(AssignError::Interrupted) => {}
+                Err(other) => return Err(other),
             }
-            None => None,
-        };
-        let cost_of_pair = |(agent, &goal): (usize, &u32)| match goal {
-            UNASSIGNED => 0.0,
-            goal => costs[agent * cols + goal as usize],
-        };
-        let pair_costs = goal_of.iter().enumerate().map(cost_of_pair).collect();
-        let isolated = if problem.forbidden.is_empty() { Default::default() } else { isolated(costs, cols) };
-        Ok(Plan { goal_of, probabilities, scheduler, cost, exact_cost, pair_costs, isolated })
+        }
+        plan.pair_costs = vec![0.0; rows];
+        pairs(&plan.goal_of).for_each(|(agent, goal)| plan.pair_costs[agent] = costs[agent * cols + goal]);
+        if !problem.forbidden.is_empty() {
+            plan.isolated = isolated(costs, cols);
+        }
+        Ok(plan)
     }
 }
 
