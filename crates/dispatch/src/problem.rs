@@ -33,7 +33,7 @@ impl Default for Limits {
 }
 
 /// The assignment problem of one team. All values are finite and in range.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Problem {
     /// N.
     pub agent_count: usize,
@@ -70,7 +70,7 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// The problem of these positions (`[N, dims]` and `[G, dims]`, world units), exact and without names, costs and current pairs.
+    /// The problem of these positions (`[N, dims]` and `[G, dims]`, world units), without names, costs and current pairs.
     pub fn of_points(agents: Vec<f32>, goals: Vec<f32>, dims: usize) -> Self {
         Self {
             agent_count: agents.len() / dims.max(1),
@@ -78,17 +78,7 @@ impl Problem {
             dims,
             agents,
             goals,
-            agent_ids: Vec::new(),
-            goal_ids: Vec::new(),
-            matrix: None,
-            overrides: Vec::new(),
-            forbidden: Vec::new(),
-            current: Vec::new(),
-            switching_cost: 0.0,
-            scheduler: AssignmentMethod::Exact,
-            mode: Mode::Greedy,
-            seed: 0,
-            deadline: None,
+            ..Self::default()
         }
     }
 
