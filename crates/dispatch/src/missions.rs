@@ -58,29 +58,12 @@ pub enum KeepError {
     Disk(#[from] DiskError),
 }
 
-/// Where changes are stored.
-#[derive(Debug)]
-enum Journal {
-    /// In memory only: missions are lost when the process ends.
-    Memory,
-    Disk(Disk),
-    Closed,
-}
-
-impl Journal {
-    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), KeepError> {
-        match self {
-            Self::Memory => Ok(()),
-            Self::Disk(disk) => Ok(disk.change(put, remove, kept)?),
-            Self::Closed => Err(KeepError::Closed),
-        }
-    }
-}
-
 /// The state that only changes use.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct WriteState {
-    journal: Journal,
+    /// Without a file, missions are lost when the process ends.
+    disk: Option<Disk>,
+    closed: bool,
     /// Bytes of each mission, of each owner's, and of all.
     sizes: HashMap<String, usize>,
     owners: HashMap<String, usize>,
@@ -88,6 +71,15 @@ struct WriteState {
 }
 
 impl WriteState {
+    /// Writes a change to the file.
+    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), KeepError> {
+        match &mut self.disk {
+            _ if self.closed => Err(KeepError::Closed),
+            Some(disk) => Ok(disk.change(put, remove, kept)?),
+            None => Ok(()),
+        }
+    }
+
     /// Sets the size of a mission; `None` when it is removed. A mission never changes its owner.
     fn resize(&mut self, mission: &Mission, size: Option<usize>) {
         let (id, owner) = (mission.id(), mission.assignment.owner.as_str());
@@ -123,8 +115,7 @@ impl Missions {
     /// Loads the missions of a file; without a file they are lost when the process ends.
     pub fn open(disk: Option<Disk>, bounds: Bounds) -> Result<Self, DiskError> {
         let loaded = disk.as_ref().map(Disk::load).transpose()?.unwrap_or_default();
-        let journal = disk.map_or(Journal::Memory, Journal::Disk);
-        let mut writing = WriteState { journal, sizes: HashMap::new(), owners: HashMap::new(), bytes: 0 };
+        let mut writing = WriteState { disk, ..WriteState::default() };
         loaded.iter().for_each(|mission| writing.resize(mission, Some(mission.bytes())));
         let kept = loaded.into_iter().map(|mission| (mission.id().to_owned(), Arc::new(mission))).collect();
         Ok(Self { kept: RwLock::new(kept), writing: Mutex::new(writing), bounds })
@@ -201,7 +192,7 @@ impl Missions {
         let mut writing = self.lock();
         let found = self.get(id).filter(|mission| may(mission));
         let mission = found.ok_or_else(|| KeepError::Missing(id.to_owned()))?;
-        writing.journal.change(&[], &[id], &self.read())?;
+        writing.change(&[], &[id], &self.read())?;
         writing.resize(&mission, None);
         self.write().remove(id);
         Ok(mission)
@@ -216,7 +207,7 @@ impl Missions {
             return Ok(old);
         }
         let ids: Vec<&str> = old.iter().map(|mission| mission.id()).collect();
-        writing.journal.change(&[], &ids, &self.read())?;
+        writing.change(&[], &ids, &self.read())?;
         old.iter().for_each(|mission| writing.resize(mission, None));
         let mut kept = self.write();
         ids.iter().for_each(|id| drop(kept.remove(*id)));
@@ -226,7 +217,8 @@ impl Missions {
 
     /// Closes the file; further changes fail.
     pub fn close(&self) {
-        self.lock().journal = Journal::Closed;
+        let mut writing = self.lock();
+        (writing.disk, writing.closed) = (None, true);
     }
 
     fn put(&self, writing: &mut WriteState, mission: Mission) -> Result<Arc<Mission>, KeepError> {
@@ -247,7 +239,7 @@ impl Missions {
                 }
             }
         }
-        writing.journal.change(&[&mission], &[], &self.read())?;
+        writing.change(&[&mission], &[], &self.read())?;
         writing.resize(&mission, Some(size));
         let mission = Arc::new(mission);
         self.write().insert(mission.id().to_owned(), mission.clone());
