@@ -3,11 +3,12 @@
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::error::to_status;
-use crate::mission_service::{self, MissionService};
+use crate::mission_service::{self, MissionService, now_ms};
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, GoalRequest};
 use crate::shard_assign::{self, ShardAssign};
 use crate::streams::{self, Interest};
+use crate::training_view::TrainingShard;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
@@ -119,7 +120,7 @@ impl CommanderService for CommanderApi {
         let (reply, method) = answer.instrument(span).await?;
         self.answering.metrics.answered(method, false, budget.elapsed());
         let message = reply.to_message(&request, version);
-        self.missions.record(request, Arc::new(reply), key, method);
+        self.missions.record(TrainingShard { request, reply, key, method, at_ms: now_ms() });
         Ok(Response::new(message))
     }
 

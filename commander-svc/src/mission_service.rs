@@ -4,7 +4,6 @@ use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
-use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use crate::training_view::{TrainingShard, TrainingView};
 use magex_dispatch::answer::Planned;
 use magex_dispatch::mission::Mission;
@@ -206,14 +205,8 @@ impl MissionService {
     }
 
     /// Shows the goals of a shard's episodes as missions.
-    pub(crate) fn record(
-        &self,
-        request: Arc<GoalRequest>,
-        reply: Arc<GoalReply>,
-        key: WeightsKey,
-        method: AssignmentMethod,
-    ) {
-        let shard = Arc::new(TrainingShard { request, reply, key, method, at_ms: now_ms() });
+    pub(crate) fn record(&self, shard: TrainingShard) {
+        let shard = Arc::new(shard);
         self.training.insert(shard.clone());
         // Fails without watchers.
         let _ = self.events.send(Event::Training(shard));

@@ -5,7 +5,7 @@ use crate::call_budget::CallBudget;
 use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::model_store::ModelStore;
-use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, WeightsKey};
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use magex_core::error::FieldError;
 use magex_dispatch::Limits;
 use magex_runtime::status;
@@ -42,7 +42,8 @@ impl ShardAssign {
         Self { store, answering, threads }
     }
 
-    /// Answers a shard with the weights that it names, once they have arrived; and the method of their scheduler.
+    /// Answers a shard on a worker thread, for as long as the call waits, with the weights that it names, once they have arrived.
+    /// Returns the method of their scheduler, too.
     pub(crate) async fn answer(
         &self,
         request: Arc<GoalRequest>,
@@ -56,22 +57,10 @@ impl ShardAssign {
             let problem = format!("weights version {version} of run '{run}' have not arrived; retry later");
             return Err(status::unavailable(problem, Duration::from_millis(500)));
         };
-        match model.scheduler {
-            Ok(scheduler) => {
-                let method = scheduler.method();
-                Ok((self.solve(request, scheduler, budget).await?, method))
-            }
-            Err(reason) => Err(status::failed_precondition(format!("weights version {}: {reason}", key.version))),
-        }
-    }
-
-    /// Runs the scheduler on a worker thread, for as long as the call waits.
-    async fn solve(
-        &self,
-        request: Arc<GoalRequest>,
-        scheduler: Arc<dyn Scheduler>,
-        budget: CallBudget,
-    ) -> Result<GoalReply, Status> {
+        let refused =
+            |reason: String| status::failed_precondition(format!("weights version {}: {reason}", key.version));
+        let scheduler = model.scheduler.map_err(refused)?;
+        let method = scheduler.method();
         let cells = request.agent_count.max(request.goal_count).pow(2);
         let places = async {
             let thread = self.threads.clone().acquire_owned().await.ok()?;
@@ -81,7 +70,7 @@ impl ShardAssign {
             return Err(status::resource_exhausted("all threads are busy with other shards", Duration::from_secs(1)));
         };
         let solve = move |work: &Work| scheduler.assign_batch(&request, &|| work.should_continue());
-        on_thread(places, budget, solve).await?.map_err(to_status)
+        Ok((on_thread(places, budget, solve).await?.map_err(to_status)?, method))
     }
 }
 

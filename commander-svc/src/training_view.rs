@@ -23,7 +23,7 @@ const LIVE_MS: i64 = 600_000;
 #[derive(Debug)]
 pub(crate) struct TrainingShard {
     pub(crate) request: Arc<GoalRequest>,
-    pub(crate) reply: Arc<GoalReply>,
+    pub(crate) reply: GoalReply,
     pub(crate) key: WeightsKey,
     /// The method of the run's scheduler.
     pub(crate) method: AssignmentMethod,
@@ -64,7 +64,7 @@ impl TrainingShard {
 
     /// One stage of one episode; `None` if its arrays are inconsistent.
     pub(crate) fn assignment(&self, place: usize) -> Option<v1::Assignment> {
-        let (request, reply) = (&*self.request, &*self.reply);
+        let (request, reply) = (&*self.request, &self.reply);
         let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
         let points =
             |values: &[f32], count: usize| Some(values.get(place * count * d..(place + 1) * count * d)?.to_vec());
