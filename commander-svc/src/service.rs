@@ -95,9 +95,6 @@ impl ServiceConfig {
 
 /// Serves until `shutdown`, then drains for `config.drain` and returns within [`server::GRACE`] more. The health is SERVING once
 /// a model is loaded, or at once if neither a learner nor weights are configured.
-///
-/// # Errors
-/// The learner's address, the weights or the certificates are unusable; the missions cannot be loaded; the server failed.
 pub async fn run(
     config: ServiceConfig,
     load_scheduler: LoadScheduler,

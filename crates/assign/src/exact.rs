@@ -67,9 +67,7 @@ pub fn exact_points(agents: &[f32], goals: &[f32], dims: usize) -> Result<(Vec<u
 
 impl Solver {
     /// The assignment of min(rows, cols) pairs with the smallest summed cost; `cost` is row-major `[rows, cols]`.
-    ///
-    /// # Errors
-    /// Empty or mismatched shapes, and the first entry that is NaN, infinite or beyond 1e300.
+    /// Fails for mismatched shapes, and at the first entry that is NaN, infinite or beyond 1e300.
     pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
         check_costs(cost, rows, cols)?;
         self.solve_checked(cost, rows, cols, None, &|| true)

@@ -110,9 +110,7 @@ impl Disk {
     }
 
     /// Writes and removes missions in one durable transaction. `kept` are all acknowledged missions.
-    ///
-    /// # Errors
-    /// The write failed. Then nothing has changed for clients, and the file is reopened before the next change.
+    /// After a failed write nothing has changed for clients, and the file is reopened before the next change.
     pub fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), DiskError> {
         // A failed write drops the database, which closes the file, so that it can be reopened.
         let database = match self.database.take() {
