@@ -136,7 +136,11 @@ pub async fn run(
         draining: draining.clone(),
     });
     let weak = Arc::downgrade(&api);
-    config.metrics.before_scrape(move || drop(weak.upgrade().map(|api| api.refresh_gauges())));
+    config.metrics.before_scrape(move || {
+        if let Some(api) = weak.upgrade() {
+            api.refresh_gauges();
+        }
+    });
     let (health, health_service) = Health::new::<CommanderServiceServer<CommanderApi>>().await;
     let service = CommanderServiceServer::from_arc(api)
         .max_decoding_message_size(config.message_bytes)
