@@ -73,8 +73,8 @@ fn a_matrix_alone_makes_a_team_and_single_costs_and_bans_change_it() {
     for kind in KINDS {
         let response = ask(&banned, kind);
         assert_eq!(response.unassigned_agents, [0]);
-        assert_eq!(response.agents_without_goal[0].reason(), v1::UnassignedReason::Forbidden, "{kind}");
-        assert_eq!(response.goals_without_agent[0].reason(), v1::UnassignedReason::Conflict, "{kind}");
+        assert_eq!(response.agents_without_goal[0].reason(), v1::UnassignedReason::Forbidden, "{kind:?}");
+        assert_eq!(response.goals_without_agent[0].reason(), v1::UnassignedReason::Conflict, "{kind:?}");
         assert_eq!(response.agents_without_goal[0].id, "a0");
     }
 }
