@@ -5,9 +5,8 @@ use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, cost_of};
 /// Pairs that are sorted at once.
 const CHUNK: usize = 1 << 16;
 
-/// Takes the cheapest remaining pair until one side is used up; ties go to the lowest (row, column). `cost` is row-major
-/// `[rows, cols]`, +∞ forbids a pair. Stops as soon as `should_continue` returns false. Fails as
-/// [`crate::Solver::solve_allowed`].
+/// Takes the cheapest remaining pair of `cost` `[rows, cols]` until one side is used up; ties go to the lowest (row, column),
+/// and +∞ forbids a pair. Stops as soon as `should_continue` returns false. Fails as [`crate::Solver::solve_allowed`].
 pub fn greedy(
     cost: &[f64],
     rows: usize,
