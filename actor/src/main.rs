@@ -2,8 +2,7 @@
 
 use clap::Parser;
 use magex_actor::cli::{ActorArgs, run};
-use magex_runtime::exit::{self, Failure};
-use magex_runtime::process::ensure_environment;
+use magex_runtime::exit;
 use std::process::ExitCode;
 
 /// Rolls out episodes for a MAGE-X learner.
@@ -15,8 +14,5 @@ struct Command {
 }
 
 fn main() -> ExitCode {
-    if let Err(error) = ensure_environment() {
-        return exit::report(Err(Failure::new(exit::INTERNAL, error)));
-    }
     exit::run(|command: Command| run(command.args))
 }

@@ -11,7 +11,8 @@ use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::{MAX_MESSAGE_BYTES, PROTOCOL_VERSION, v1};
 use magex_runtime::backoff::{Backoff, random_id};
-use magex_runtime::client::{Channel, Settings, UrlError};
+use magex_runtime::client::{Channel, Settings};
+use magex_runtime::exit::Failure;
 use magex_runtime::metrics::Metrics;
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,7 +27,7 @@ const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
 const POOL_SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Where an actor works.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct ActorConfig {
     /// The learner, `http://host:port`.
     pub learner_url: String,
@@ -49,7 +50,7 @@ pub struct ActorConfig {
 pub enum ActorError {
     /// An address is wrong.
     #[error(transparent)]
-    Url(#[from] UrlError),
+    Url(#[from] Failure),
     /// No rollout threads.
     #[error("threads: 0 is too few; use --threads 1 or more")]
     NoThreads,

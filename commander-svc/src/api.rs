@@ -3,18 +3,20 @@
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::error::to_status;
-use crate::mission_service::{self, MissionService};
+use crate::mission_service::{self, MissionService, now_ms};
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, GoalRequest};
 use crate::shard_assign::{self, ShardAssign};
 use crate::streams::{self, Interest};
+use crate::training_view::TrainingShard;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
 use magex_runtime::net::auth::{Role, caller};
-use magex_runtime::net::in_flight::InFlight;
+use magex_runtime::net::in_flight::{CallKind, InFlight};
 use magex_runtime::{status, trace};
 use std::sync::Arc;
+use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
@@ -30,7 +32,6 @@ const CLIENT: &[Role] = &[Role::Client];
 pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments"];
 
 /// Implements the service.
-#[derive(Debug)]
 pub(crate) struct CommanderApi {
     pub(crate) store: Arc<ModelStore>,
     pub(crate) answering: Arc<AssignService>,
@@ -39,6 +40,19 @@ pub(crate) struct CommanderApi {
     pub(crate) in_flight: Arc<InFlight>,
     pub(crate) limits: Limits,
     pub(crate) draining: CancellationToken,
+}
+
+impl CommanderApi {
+    /// Sets the gauges that are computed on demand.
+    pub(crate) fn refresh_gauges(&self) {
+        let metrics = &self.answering.metrics;
+        metrics.in_flight.set(self.in_flight.count(CallKind::Call) as f64);
+        metrics.streams.set(self.in_flight.count(CallKind::Stream) as f64);
+        metrics.missions.set(self.missions.missions.count() as f64);
+        metrics.backlog.set(self.missions.events.len() as f64);
+        metrics.weights_version.set(self.store.latest().map_or(-1.0, |(key, _)| f64::from(key.version.0)));
+        metrics.free_processors.set(self.answering.processors.available_permits() as f64);
+    }
 }
 
 type Answer<T> = Result<Response<T>, Status>;
@@ -67,11 +81,11 @@ impl CommanderService for CommanderApi {
             let problem = format!("{} teams; send 1 to {}", teams.len(), self.limits.teams);
             return Err(status::invalid_argument("teams", problem));
         }
-        let mut problems = Vec::with_capacity(teams.len());
-        for (k, team) in teams.into_iter().enumerate() {
+        let read = |(k, team)| {
             let problem = Problem::read(team, self.answering.seed(), &self.limits);
-            problems.push(problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))?);
-        }
+            problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))
+        };
+        let problems: Vec<Problem> = teams.into_iter().enumerate().map(read).collect::<Result<_, _>>()?;
         let mut answers = Vec::with_capacity(problems.len());
         for problem in problems {
             answers.push(self.answering.respond(problem, budget).await?);
@@ -86,7 +100,7 @@ impl CommanderService for CommanderApi {
         request: Request<Streaming<v1::AssignStreamRequest>>,
     ) -> Answer<Self::AssignStreamStream> {
         caller(&request, CLIENT)?;
-        let (answers, stream) = streams::channel();
+        let (answers, stream) = mpsc::channel(streams::AHEAD);
         let (answering, in_flight, draining) = (self.answering.clone(), self.in_flight.clone(), self.draining.clone());
         let teams = request.into_inner();
         tokio::spawn(streams::assign(answering, in_flight, self.limits, teams, answers, draining));
@@ -99,14 +113,14 @@ impl CommanderService for CommanderApi {
         trace::continue_from(&span, trace::of(request.metadata()));
         let budget = budget(&request);
         let (request, key) = GoalRequest::from_message(request.into_inner()).map_err(to_status)?;
-        shard_assign::check(&request, &key, &self.limits)?;
+        shard_assign::check(&request, &key, &self.limits).map_err(to_status)?;
         let version = request.shard.version;
         let request = Arc::new(request);
         let answer = self.shards.answer(request.clone(), &key, budget, &self.draining);
         let (reply, method) = answer.instrument(span).await?;
         self.answering.metrics.answered(method, false, budget.elapsed());
         let message = reply.to_message(&request, version);
-        self.missions.record(request, Arc::new(reply), key, method);
+        self.missions.record(TrainingShard { request, reply, key, method, at_ms: now_ms() });
         Ok(Response::new(message))
     }
 
@@ -144,16 +158,14 @@ impl CommanderService for CommanderApi {
     ) -> Answer<Self::WatchAssignmentsStream> {
         let caller = caller(&request, CLIENT)?;
         let request = request.into_inner();
-        if request.mission_ids.len() > WATCHED {
-            let problem = format!(
-                "{} names exceed the limit of {WATCHED}; leave the list empty to watch all",
-                request.mission_ids.len()
-            );
+        let names = request.mission_ids.len();
+        if names > WATCHED {
+            let problem = format!("{names} names exceed the limit of {WATCHED}; leave the list empty to watch all");
             return Err(status::invalid_argument("mission_ids", problem));
         }
-        let source = mission_service::source("source", request.source)?;
+        let source = mission_service::source(request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
-        let (watcher, stream) = streams::channel();
+        let (watcher, stream) = mpsc::channel(streams::AHEAD);
         tokio::spawn(streams::watch(self.missions.clone(), interest, watcher, self.draining.clone()));
         Ok(Response::new(ReceiverStream::new(stream)))
     }

@@ -4,13 +4,13 @@
 //! are answered on worker threads, limited by processors and by memory.
 
 use crate::call_budget::CallBudget;
-use crate::cancel::CancelOnDrop;
+use crate::cancel::on_thread;
 use crate::error::{to_status, too_late};
 use crate::metrics::CommanderMetrics;
 use crate::model_store::ModelStore;
-use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply, TeamRequest, WeightsKey};
-use magex_dispatch::mission::Planned;
-use magex_dispatch::{DispatchError, Problem, answer, engine};
+use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::{AssignError, Problem, engine};
 use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::status;
@@ -41,11 +41,11 @@ const UNIT: usize = 1_000_000;
 const UNITS: usize = 26;
 
 /// Answers teams.
-#[derive(Debug)]
 pub(crate) struct AssignService {
     store: Arc<ModelStore>,
     pub(crate) metrics: Arc<CommanderMetrics>,
-    processors: Arc<Semaphore>,
+    /// One permit per processor that may answer a large team.
+    pub(crate) processors: Arc<Semaphore>,
     memory: Arc<Semaphore>,
     /// Recent duration of the model on a small team, nanoseconds: a maximum that decays. It only chooses the thread.
     model_nanos: AtomicU64,
@@ -55,17 +55,6 @@ pub(crate) struct AssignService {
 
 /// A processor, and memory.
 pub(crate) type Places = (OwnedSemaphorePermit, OwnedSemaphorePermit);
-
-/// Where a team is answered.
-#[derive(Debug)]
-enum Route {
-    /// On the thread of the call.
-    Here,
-    /// On a worker thread.
-    Thread(Places),
-    /// On the thread of the call, by the exact method: no processor is free for the model.
-    ExactBecauseBusy,
-}
 
 impl AssignService {
     pub(crate) fn new(store: Arc<ModelStore>, metrics: Arc<CommanderMetrics>) -> Arc<Self> {
@@ -89,74 +78,60 @@ impl AssignService {
         let budget = budget.limited(problem.deadline);
         let problem = Arc::new(problem);
         let planned = self.plan(&problem, budget).await?;
-        let mut response = answer::write(&problem, &planned.plan);
-        response.fallback_reason = planned.fallback_reason;
-        if let Some((version, sha256, run)) = planned.weights {
-            (response.version, response.sha256, response.run_id) = (version, sha256, run);
-        }
+        let mut response = planned.respond(&problem);
         let elapsed = budget.elapsed();
         response.seconds = elapsed.as_secs_f64();
         self.metrics.answered(response.scheduler().into(), !response.fallback_reason.is_empty(), elapsed);
         Ok(response)
     }
 
+    /// Answers a small team on the thread of the call, a large one on worker threads. The exact method answers here while no
+    /// processor is free for the model.
     async fn plan(self: &Arc<Self>, problem: &Arc<Problem>, budget: CallBudget) -> Result<Planned, Status> {
+        let (small, learned) = (problem.cells() <= SMALL, problem.scheduler == AssignmentMethod::Learned);
+        let (here, cells) = match learned {
+            true => (self.small_for_model(problem, &budget), engine::learned_cells(problem)),
+            false => (small, problem.cells()),
+        };
         let should_continue = || !budget.over();
-        let planned = match self.route(problem, &budget).await? {
-            Route::Here => self.plan_here(problem, budget.learned(), &should_continue),
-            Route::ExactBecauseBusy => {
-                solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+        let planned = if here {
+            self.plan_here(problem, budget.learned(), &should_continue)
+        } else {
+            match self.places(cells, budget.left()).await {
+                Ok(places) => return self.plan_on_thread(problem, budget, places).await,
+                Err(_) if learned && small => {
+                    solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+                }
+                Err(busy) => return Err(busy),
             }
-            Route::Thread(places) => return self.plan_on_thread(problem, budget, Arc::new(places)).await,
         };
         let planned = planned.map_err(to_status)?;
         if budget.over() { Err(too_late()) } else { Ok(planned) }
     }
 
-    /// Chooses where a team is answered, and waits for a worker thread if it needs one.
-    async fn route(&self, problem: &Problem, budget: &CallBudget) -> Result<Route, Status> {
-        let small = problem.cells() <= SMALL;
-        if problem.scheduler != AssignmentMethod::Learned {
-            return match small {
-                true => Ok(Route::Here),
-                false => self.places(problem.cells(), budget.left()).await.map(Route::Thread),
-            };
-        }
-        if self.small_for_model(problem, budget) {
-            return Ok(Route::Here);
-        }
-        match self.places(engine::learned_cells(problem), budget.left()).await {
-            Ok(places) => Ok(Route::Thread(places)),
-            Err(_) if small => Ok(Route::ExactBecauseBusy),
-            Err(busy) => Err(busy),
-        }
-    }
-
-    /// Answers on worker threads. The learned method is abandoned at its time limit.
+    /// Answers on worker threads. The learned method is cancelled at its time limit.
     async fn plan_on_thread(
         self: &Arc<Self>,
         problem: &Arc<Problem>,
         budget: CallBudget,
-        places: Arc<Places>,
+        places: Places,
     ) -> Result<Planned, Status> {
-        let mut reason = String::new();
+        let (places, mut reason) = (Arc::new(places), String::new());
         if problem.scheduler == AssignmentMethod::Learned {
-            match self.ask_on_thread(problem, budget, places.clone()).await {
-                Ok(planned) => return Ok(planned),
-                Err(why) => reason = why,
+            let (own, problem, limit) = (self.clone(), problem.clone(), budget.learned());
+            let asking =
+                on_thread(places.clone(), budget, move |work| own.ask_learned(&problem, &|| work.should_continue()));
+            match tokio::time::timeout(limit, asking).await {
+                Ok(Ok(Ok(planned))) => return Ok(planned),
+                Ok(Ok(Err(why))) => reason = why,
+                Ok(Err(_)) => MODEL_FAILED.clone_into(&mut reason),
+                Err(_) => reason = exceeded(limit),
             }
         }
-        let cancel = CancelOnDrop::default();
-        let (problem, work) = (problem.clone(), cancel.work(budget));
-        let solving = tokio::task::spawn_blocking(move || {
-            // Held until the thread has finished, even if the call has ended.
-            let _held = places;
-            solve(&problem, reason, &|| work.should_continue())
-        });
-        tokio::select! {
-            done = solving => done.map_err(|error| Status::internal(error.to_string()))?.map_err(to_status),
-            () = tokio::time::sleep_until((budget.until() + LATE).into()) => Err(too_late()),
-        }
+        let problem = problem.clone();
+        let solving = on_thread(places, budget, move |work| solve(&problem, reason, &|| work.should_continue()));
+        let solved = tokio::time::timeout_at((budget.until + LATE).into(), solving).await;
+        solved.map_err(|_| too_late())??.map_err(to_status)
     }
 
     /// The model answers teams of this size in a fraction of its time limit.
@@ -166,11 +141,6 @@ impl AssignService {
         }
         let recent = Duration::from_nanos(self.model_nanos.load(Ordering::Relaxed));
         engine::learned_cells(problem) <= SMALL_LEARNED && recent.saturating_mul(MARGIN) <= budget.learned()
-    }
-
-    /// Processors that are free for large teams.
-    pub(crate) fn free_processors(&self) -> usize {
-        self.processors.available_permits()
     }
 
     /// A processor, and memory for `cells` pairs.
@@ -191,34 +161,13 @@ impl AssignService {
         self.memory.clone().acquire_many_owned(units).await.ok()
     }
 
-    /// Asks the learned scheduler on another thread, and cancels it at its time limit.
-    async fn ask_on_thread(
-        self: &Arc<Self>,
-        problem: &Arc<Problem>,
-        budget: CallBudget,
-        places: Arc<Places>,
-    ) -> Result<Planned, String> {
-        let (own, problem, limit) = (self.clone(), problem.clone(), budget.learned());
-        let cancel = CancelOnDrop::default();
-        let work = cancel.work(budget);
-        let answer = tokio::task::spawn_blocking(move || {
-            let _held = places;
-            own.ask_learned(&problem, &|| work.should_continue())
-        });
-        match tokio::time::timeout(limit, answer).await {
-            Ok(Ok(answer)) => answer,
-            Ok(Err(_)) => Err(MODEL_FAILED.to_owned()),
-            Err(_) => Err(exceeded(limit)),
-        }
-    }
-
     /// Answers on this thread. The answer of a learned scheduler that exceeded `limit` is dropped.
     pub(crate) fn plan_here(
         &self,
         problem: &Problem,
         limit: Duration,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Planned, DispatchError> {
+    ) -> Result<Planned, AssignError> {
         let mut reason = String::new();
         if problem.scheduler == AssignmentMethod::Learned {
             let start = Instant::now();
@@ -257,7 +206,8 @@ impl AssignService {
             return Err("the model answered after the deadline".to_owned());
         }
         let plan = engine::adopt(problem, reply.goals, reply.probabilities, should_continue)?;
-        Ok(Planned { plan, fallback_reason: String::new(), weights: Some(names(&key)) })
+        let weights = (key.version.0, key.sha256.clone(), key.run_id.0.clone());
+        Ok(Planned { plan, fallback_reason: String::new(), weights: Some(weights) })
     }
 }
 
@@ -268,34 +218,17 @@ fn solve(
     problem: &Problem,
     fallback_reason: String,
     should_continue: &dyn Fn() -> bool,
-) -> Result<Planned, DispatchError> {
-    let method = match problem.scheduler {
-        AssignmentMethod::Learned => AssignmentMethod::Exact,
-        other => other,
-    };
-    let plan = engine::solve(problem, method, should_continue)?;
+) -> Result<Planned, AssignError> {
+    let plan = engine::solve(problem, problem.scheduler, should_continue)?;
     Ok(Planned { plan, fallback_reason, weights: None })
 }
 
 fn ask(problem: &Problem, scheduler: &dyn Scheduler) -> Result<TeamReply, String> {
-    let request = TeamRequest {
-        agent_count: problem.agent_count,
-        goal_count: problem.goal_count,
-        dims: problem.dims,
-        agents: problem.agents.clone(),
-        goals: problem.goals.clone(),
-        mode: problem.mode,
-        seed: problem.seed,
-    };
     // A panic of the model must not end the service.
-    match catch_unwind(AssertUnwindSafe(|| scheduler.assign_team(&request))) {
+    match catch_unwind(AssertUnwindSafe(|| scheduler.assign_team(problem))) {
         Ok(reply) => reply.map_err(|error| error.to_string()),
         Err(_) => Err(MODEL_FAILED.to_owned()),
     }
-}
-
-fn names(key: &WeightsKey) -> (u32, String, String) {
-    (key.version.0, key.sha256.clone(), key.run_id.0.clone())
 }
 
 fn exceeded(limit: Duration) -> String {

@@ -13,7 +13,8 @@ const LEARNED: Duration = Duration::from_millis(500);
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct CallBudget {
     start: Instant,
-    until: Instant,
+    /// The deadline.
+    pub(crate) until: Instant,
     /// The caller set a deadline.
     explicit: bool,
 }
@@ -42,11 +43,6 @@ impl CallBudget {
     /// Time since the request arrived.
     pub(crate) fn elapsed(&self) -> Duration {
         self.start.elapsed()
-    }
-
-    /// The deadline.
-    pub(crate) fn until(&self) -> Instant {
-        self.until
     }
 
     /// Time to the deadline.

@@ -1,7 +1,7 @@
 //! The commander's command line.
 
 use crate::run_scheduler::load_scheduler;
-use crate::service::{ServeError, ServiceConfig, run as serve};
+use crate::service::{ServiceConfig, run as serve};
 use crate::weights_file::WeightsFile;
 use clap::Args;
 use magex_dispatch::Limits;
@@ -81,10 +81,8 @@ pub struct CommanderArgs {
 impl CommanderArgs {
     /// Validates the options and reads the files that they name.
     fn config(&self) -> Result<ServiceConfig, Failure> {
-        let weights = match &self.weights {
-            Some(path) => Some(WeightsFile::find(path, self.config.as_deref()).map_err(Failure::usage)?),
-            None => None,
-        };
+        let find = |path: &PathBuf| WeightsFile::find(path, self.config.as_deref());
+        let weights = self.weights.as_ref().map(find).transpose()?;
         let security = self.security.read(&self.listen)?;
         let client = self.client.read(self.security.own(), self.security.insecure)?;
         let each = MissionLimits {
@@ -126,11 +124,7 @@ pub fn run(args: CommanderArgs) -> Result<u8, Failure> {
     service::main("commander", 2, &args.service, async |mut context| {
         let (incoming, _) = context.listen(&args.listen, args.security.connections()).await?;
         context.announce(http::routes(config.metrics.clone()));
-        serve(config, load_scheduler, incoming, context.stop).await.map_err(|error| match &error {
-            ServeError::Url(_) | ServeError::Weights(_) | ServeError::Tls(_) => Failure::usage(&error),
-            ServeError::Missions { .. } | ServeError::Data { .. } => Failure::new(exit::CANNOT_CREATE, &error),
-            ServeError::Transport(_) | ServeError::Reflection(_) => Failure::new(exit::INTERNAL, &error),
-        })
+        serve(config, load_scheduler, incoming, context.stop).await
     })?;
     Ok(exit::OK)
 }

@@ -1,9 +1,9 @@
 //! The goal commander as a service: for the actors of a run, and for external clients with agents and goals.
 //!
 //! [`service`] builds and serves it; `api` implements the gRPC contract. A call of an external client goes to `assign_service`
-//! (single teams, streams) or `mission_service` (stored teams). A shard of an actor goes to `shard_assign`, which asks the
-//! scheduler of its run ([`scheduler`], [`run_scheduler`], [`shard_goals`]). `model_store` holds the weights of the learner
-//! (`subscription`) or of a file ([`weights_file`]).
+//! or `mission_service`. A shard of an actor goes to `shard_assign`, which asks the scheduler of its run ([`scheduler`],
+//! [`run_scheduler`], [`shard_goals`]). `model_store` holds the weights of the learner (`subscription`) or of a file
+//! ([`weights_file`]).
 
 mod api;
 mod assign_service;

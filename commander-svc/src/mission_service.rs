@@ -2,18 +2,19 @@
 
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
-use crate::cancel::{CancelOnDrop, Work};
+use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
-use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
-use crate::training_view::{Episode, TrainingShard, TrainingView};
-use magex_dispatch::mission::{Mission, Planned};
+use crate::training_view::{TrainingShard, TrainingView};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::mission::Mission;
 use magex_dispatch::missions::{KeepError, Missions, passes};
-use magex_dispatch::{DispatchError, Problem};
+use magex_dispatch::{AssignError, Problem};
 use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::net::auth::{Caller, Role};
 use magex_runtime::status;
-use std::sync::{Arc, Mutex, PoisonError};
+use magex_runtime::sync::lock;
+use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::sync::broadcast;
 use tonic::Status;
@@ -38,12 +39,11 @@ pub(crate) enum Event {
 }
 
 /// All missions, and the channel to their watchers.
-#[derive(Debug)]
 pub(crate) struct MissionService {
-    missions: Missions,
+    pub(crate) missions: Missions,
     training: TrainingView,
     answering: Arc<AssignService>,
-    events: broadcast::Sender<Event>,
+    pub(crate) events: broadcast::Sender<Event>,
     /// Held from a change until its event is sent, so that watchers see changes in order.
     order: Mutex<()>,
 }
@@ -71,19 +71,16 @@ impl MissionService {
     ) -> Result<v1::Assignment, Status> {
         let cells = self.cells((0, 0), (request.agents.len(), request.goals.len()), learned(request.scheduler));
         let (own, places) = (self.clone(), self.answering.places(cells, budget.left()).await?);
-        let cancel = CancelOnDrop::default();
-        let work = cancel.work(budget);
-        blocking(move || {
-            let _held = places;
+        on_thread(places, budget, move |work| {
             own.missions.check_room(&caller.name).map_err(to_status)?;
-            let (now, each) = (now_ms(), own.missions.bounds().each);
+            let (now, each) = (now_ms(), own.missions.bounds.each);
             let drawn = format!("m-{:016x}", random_id());
-            let planner = |problem: &Problem| own.plan(problem, &work);
+            let planner = own.planner(work);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(to_status)?;
-            check(&work)?;
+            check(work)?;
             own.change(v1::WatchKind::Changed, || own.missions.insert(mission)).map_err(to_status)
         })
-        .await
+        .await?
     }
 
     pub(crate) async fn update(
@@ -92,16 +89,13 @@ impl MissionService {
         request: v1::UpdateMissionRequest,
         budget: CallBudget,
     ) -> Result<v1::Assignment, Status> {
-        let cancel = CancelOnDrop::default();
-        for _ in 1..ATTEMPTS {
-            if let Some(assignment) = self.try_update(&caller, &request, cancel.work(budget), false).await? {
+        for attempt in 1..=ATTEMPTS {
+            let last = attempt == ATTEMPTS;
+            if let Some(assignment) = self.try_update(&caller, &request, budget, last).await? {
                 return Ok(assignment);
             }
         }
-        let last = self.try_update(&caller, &request, cancel.work(budget), true).await?;
-        last.ok_or_else(|| {
-            Status::aborted("the mission changes faster than it is planned; send fewer updates at a time")
-        })
+        Err(Status::aborted("the mission changes faster than it is planned; send fewer updates at a time"))
     }
 
     /// One attempt at an update; `None` if the mission changed concurrently.
@@ -109,15 +103,14 @@ impl MissionService {
         self: &Arc<Self>,
         caller: &Caller,
         request: &v1::UpdateMissionRequest,
-        work: Work,
+        budget: CallBudget,
         last: bool,
     ) -> Result<Option<v1::Assignment>, Status> {
         let mission = self.writable(caller, &request.mission_id)?;
         let most = self.most_cells(&mission, request);
-        let (own, places) = (self.clone(), self.answering.places(most, work.budget.left()).await?);
+        let (own, places) = (self.clone(), self.answering.places(most, budget.left()).await?);
         let (caller, request) = (caller.clone(), request.clone());
-        blocking(move || {
-            let _held = places;
+        on_thread(places, budget, move |work| {
             let before = own.writable(&caller, &request.mission_id)?;
             let was = before.assignment.revision;
             if let Some(expected) = request.expected_revision.filter(|&expected| expected != was) {
@@ -129,28 +122,27 @@ impl MissionService {
                 // It has outgrown the reserved memory.
                 return Ok(None);
             }
-            let (each, again) = (own.missions.bounds().each, request.expected_revision.is_none() && !last);
-            let planner = |problem: &Problem| own.plan(problem, &work);
-            let next = before.update(request, now_ms(), &each, &planner).map_err(to_status)?;
-            check(&work)?;
+            let (each, again) = (own.missions.bounds.each, request.expected_revision.is_none() && !last);
+            let next = before.update(request, now_ms(), &each, &own.planner(work)).map_err(to_status)?;
+            check(work)?;
             match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
                 Err(KeepError::Changed { .. }) if again => Ok(None),
                 result => result.map(Some).map_err(to_status),
             }
         })
-        .await
+        .await?
     }
 
     pub(crate) async fn delete(self: &Arc<Self>, caller: Caller, id: String) -> Result<(), Status> {
         let own = self.clone();
-        blocking(move || {
+        let deleting = tokio::task::spawn_blocking(move || {
             let may = |mission: &Mission| visible(&caller, mission, now_ms());
             match own.change(v1::WatchKind::Deleted, || own.missions.remove(&id, may)) {
                 Err(KeepError::Missing(_)) => Err(own.absent(&id)),
                 result => result.map(drop).map_err(to_status),
             }
-        })
-        .await
+        });
+        deleting.await.map_err(|error| Status::internal(error.to_string()))?
     }
 
     pub(crate) fn get(&self, caller: &Caller, id: &str) -> Result<v1::Assignment, Status> {
@@ -165,7 +157,7 @@ impl MissionService {
         caller: &Caller,
         request: &v1::ListAssignmentsRequest,
     ) -> Result<v1::ListAssignmentsResponse, Status> {
-        let source = source("source", request.source)?;
+        let source = source(request.source)?;
         let size = match request.page_size as usize {
             0 => PAGE,
             size => size.min(LONGEST_PAGE),
@@ -176,8 +168,7 @@ impl MissionService {
         Ok(v1::ListAssignmentsResponse { assignments, next_page_token })
     }
 
-    /// Up to `count` assignments after this name, by name, within [`PAGE_BYTES`] (but at least one); and whether there are
-    /// more.
+    /// Up to `count` assignments after this name, by name, within [`PAGE_BYTES`] (but at least one); whether there are more.
     pub(crate) fn after(
         &self,
         caller: &Caller,
@@ -187,24 +178,21 @@ impl MissionService {
     ) -> (Vec<v1::Assignment>, bool) {
         let now = now_ms();
         // One more tells whether there is another page.
-        let (mut missions, mut episodes) = (Vec::new(), Vec::new());
-        if passes(filter, v1::MissionSource::Client) {
-            missions = self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
-        }
-        if passes(filter, v1::MissionSource::Training) {
-            episodes = self.training.page(name, count + 1, now);
-        }
+        let missions = || self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
+        let missions = passes(filter, v1::MissionSource::Client).then(missions).unwrap_or_default();
+        let episodes = || self.training.page(name, count + 1, now);
+        let episodes = passes(filter, v1::MissionSource::Training).then(episodes).unwrap_or_default();
         let (mut missions, mut episodes) = (missions.iter().peekable(), episodes.iter().peekable());
         let (mut found, mut bytes) = (Vec::new(), 0);
         loop {
             let client_first = match (missions.peek(), episodes.peek()) {
                 (None, None) => return (found, false),
-                (Some(mission), Some(episode)) => mission.id() <= episode.name.as_str(),
+                (Some(mission), Some((name, ..))) => mission.id() <= name.as_str(),
                 (mission, _) => mission.is_some(),
             };
             let assignment = match client_first {
                 true => missions.next().map(|mission| mission.assignment.clone()),
-                false => episodes.next().and_then(Episode::assignment),
+                false => episodes.next().and_then(|(_, shard, place)| shard.assignment(*place)),
             };
             // An inconsistent episode is skipped.
             let Some(assignment) = assignment else { continue };
@@ -216,45 +204,19 @@ impl MissionService {
         }
     }
 
-    /// The events from now on.
-    pub(crate) fn events(&self) -> broadcast::Receiver<Event> {
-        self.events.subscribe()
-    }
-
     /// Shows the goals of a shard's episodes as missions.
-    pub(crate) fn record(
-        &self,
-        request: Arc<GoalRequest>,
-        reply: Arc<GoalReply>,
-        key: WeightsKey,
-        method: AssignmentMethod,
-    ) {
-        let shard = Arc::new(TrainingShard { request, reply, key, method, at_ms: now_ms() });
+    pub(crate) fn record(&self, shard: TrainingShard) {
+        let shard = Arc::new(shard);
         self.training.insert(shard.clone());
         // Fails without watchers.
         let _ = self.events.send(Event::Training(shard));
-    }
-
-    /// Missions of clients.
-    pub(crate) fn count(&self) -> usize {
-        self.missions.count()
-    }
-
-    /// Events that the slowest watcher has not received.
-    pub(crate) fn backlog(&self) -> usize {
-        self.events.len()
-    }
-
-    /// Closes the file, so that another commander can open it.
-    pub(crate) fn close(&self) {
-        self.missions.close();
     }
 
     /// Deletes expired missions.
     pub(crate) async fn sweep(self: &Arc<Self>) {
         let own = self.clone();
         let sweeping = move || {
-            let _order = own.order.lock().unwrap_or_else(PoisonError::into_inner);
+            let _order = lock(&own.order);
             let old = own.missions.expire(now_ms())?;
             old.into_iter().for_each(|mission| drop(own.publish(v1::WatchKind::Expired, mission)));
             Ok::<(), KeepError>(())
@@ -268,7 +230,7 @@ impl MissionService {
 
     /// Upper bound of the pairs that a scheduler sees in a mission of (agents, goals) after `more` are added.
     fn cells(&self, (agents, goals): (usize, usize), more: (usize, usize), learned: bool) -> usize {
-        let most = self.missions.bounds().each.members;
+        let most = self.missions.bounds.each.members;
         let (agents, goals) = ((agents + more.0).min(most), (goals + more.1).min(most));
         // The learned scheduler pads the smaller side.
         if learned { agents.max(goals).pow(2) } else { agents * goals }
@@ -279,8 +241,8 @@ impl MissionService {
         self.cells(before.size(), (request.agents.len(), request.goals.len()), learned)
     }
 
-    fn plan(&self, problem: &Problem, work: &Work) -> Result<Planned, DispatchError> {
-        self.answering.plan_here(problem, work.budget.learned(), &|| work.should_continue())
+    fn planner(&self, work: &Work) -> impl Fn(&Problem) -> Result<Planned, AssignError> {
+        move |problem| self.answering.plan_here(problem, work.budget.learned(), &|| work.should_continue())
     }
 
     /// A mission that this caller may change.
@@ -304,8 +266,7 @@ impl MissionService {
         kind: v1::WatchKind,
         change: impl FnOnce() -> Result<Arc<Mission>, KeepError>,
     ) -> Result<v1::Assignment, KeepError> {
-        // The lock guards no value, so a panic cannot leave it inconsistent.
-        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+        let _order = lock(&self.order);
         Ok(self.publish(kind, change()?))
     }
 
@@ -319,7 +280,7 @@ impl MissionService {
 
 /// Before something is written: a call that was answered with an error has changed nothing.
 fn check(work: &Work) -> Result<(), Status> {
-    if work.should_continue() { Ok(()) } else { Err(to_status(DispatchError::Interrupted)) }
+    if work.should_continue() { Ok(()) } else { Err(to_status(AssignError::Interrupted)) }
 }
 
 fn learned(scheduler: i32) -> bool {
@@ -332,17 +293,13 @@ pub(crate) fn visible(caller: &Caller, mission: &Mission, now: i64) -> bool {
     own && mission.assignment.expires_ms > now
 }
 
-pub(crate) fn source(field: &str, value: i32) -> Result<v1::MissionSource, Status> {
+pub(crate) fn source(value: i32) -> Result<v1::MissionSource, Status> {
     v1::MissionSource::try_from(value)
-        .map_err(|_| status::invalid_argument(field, format!("{value} is not a source; use client or training")))
+        .map_err(|_| status::invalid_argument("source", format!("{value} is not a source; use client or training")))
 }
 
 fn missing(id: &str) -> Status {
     Status::not_found(format!("there is no mission '{id}'"))
-}
-
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, Status> + Send + 'static) -> Result<T, Status> {
-    tokio::task::spawn_blocking(work).await.map_err(|error| Status::internal(error.to_string()))?
 }
 
 #[cfg(test)]

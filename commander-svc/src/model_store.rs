@@ -1,7 +1,6 @@
 //! The models in memory, newest last.
 
 use crate::scheduler::{Scheduler, WeightsKey};
-use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
@@ -16,14 +15,7 @@ pub(crate) struct Model {
     pub(crate) scheduler: Result<Arc<dyn Scheduler>, String>,
 }
 
-impl fmt::Debug for Model {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Model").field("key", &self.key).field("problem", &self.scheduler.as_ref().err()).finish()
-    }
-}
-
 /// Filled by the subscription or the weights file; requests read it and may wait for a version.
-#[derive(Debug)]
 pub(crate) struct ModelStore {
     models: watch::Sender<Arc<Vec<Model>>>,
 }

@@ -1,10 +1,11 @@
 //! The scheduler that a run's configuration names, with the run's weights.
 
-use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply};
 use crate::shard_goals::answer;
 use magex_assign::UNASSIGNED;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::rng::{Key, Purpose};
+use magex_dispatch::Problem;
 use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::convert::ConvertError;
 use std::sync::Arc;
@@ -18,9 +19,6 @@ pub struct RunScheduler {
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
-///
-/// # Errors
-/// The configuration or the weights are invalid.
 pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     let config = RunConfig::from_toml(run_config_toml).map_err(|error| SchedulerError::Load(error.to_string()))?;
     let commander = match Commander::classical(config.commander.kind) {
@@ -54,15 +52,15 @@ impl Scheduler for RunScheduler {
         }
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, problem: &Problem) -> Result<TeamReply, SchedulerError> {
         if self.method() != AssignmentMethod::Learned {
             return Err(SchedulerError::Unsupported("the run has no learned scheduler".to_owned()));
         }
-        let team = Team { agents: &request.agents, goals: &request.goals, dims: request.dims };
-        let mut stream = Key::new(request.seed, Purpose::Request, &[]).stream();
+        let team = Team { agents: &problem.agents, goals: &problem.goals, dims: problem.dims };
+        let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
         let decision = self
             .commander
-            .assign(&team, request.mode, &mut stream)
+            .assign(&team, problem.mode, &mut stream)
             .map_err(|error| SchedulerError::Unsupported(error.to_string()))?;
         let goals = decision.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
         Ok(TeamReply { goals, probabilities: Some(decision.probabilities) })

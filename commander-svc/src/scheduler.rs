@@ -1,28 +1,9 @@
 //! The interface to the scheduler of a run.
 
-use magex_core::ids::Mode;
+use magex_dispatch::Problem;
 use magex_proto::convert::ConvertError;
 pub use magex_proto::goals::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use std::sync::Arc;
-
-/// One team of an external client. N and G may differ.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TeamRequest {
-    /// N: agents.
-    pub agent_count: usize,
-    /// G: goals.
-    pub goal_count: usize,
-    /// D: space dimensions.
-    pub dims: usize,
-    /// `[N, D]` world units.
-    pub agents: Vec<f32>,
-    /// `[G, D]` world units.
-    pub goals: Vec<f32>,
-    /// How the goals are chosen.
-    pub mode: Mode,
-    /// Key of the random choices.
-    pub seed: u64,
-}
 
 /// The assignment of one team.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,8 +48,8 @@ pub trait Scheduler: Send + Sync {
         AssignmentMethod::Learned
     }
 
-    /// Goals for one team; random choices are keyed by the seed.
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError>;
+    /// Goals for the positions of one team of an external client; N and G may differ. Random choices are keyed by its seed.
+    fn assign_team(&self, problem: &Problem) -> Result<TeamReply, SchedulerError>;
 }
 
 /// Makes a scheduler of the weights (safetensors) and the run's configuration (TOML).

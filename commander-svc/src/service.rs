@@ -8,23 +8,22 @@ use crate::model_store::ModelStore;
 use crate::scheduler::LoadScheduler;
 use crate::shard_assign::ShardAssign;
 use crate::subscription;
-use crate::weights_file::{WeightsError, WeightsFile};
+use crate::weights_file::WeightsFile;
 use magex_dispatch::Limits;
-use magex_dispatch::disk::{Disk, DiskError};
+use magex_dispatch::disk::Disk;
 use magex_dispatch::missions::{Bounds, Missions};
 use magex_proto::v1::commander_service_server::CommanderServiceServer;
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_BATCH_BYTES};
-use magex_runtime::client::{Settings, UrlError};
+use magex_runtime::client::Settings;
+use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::Health;
 use magex_runtime::metrics::Metrics;
-use magex_runtime::net::call_metrics::Counted;
-use magex_runtime::net::deadline::WithDeadline;
 use magex_runtime::net::guard::{Guard, Rules};
 use magex_runtime::net::in_flight::{CallKind, InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
-use magex_runtime::tls::TlsError;
-use std::path::PathBuf;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::task::JoinSet;
@@ -94,42 +93,6 @@ impl ServiceConfig {
     }
 }
 
-/// Why serving failed.
-#[derive(Debug, thiserror::Error)]
-pub enum ServeError {
-    /// The learner's address is malformed.
-    #[error("learner: {0}")]
-    Url(#[from] UrlError),
-    /// The weights are unusable.
-    #[error("weights: {0}")]
-    Weights(#[from] WeightsError),
-    /// The missions cannot be loaded.
-    #[error("missions in {}: {source}", path.display())]
-    Missions {
-        /// Their file or folder.
-        path: PathBuf,
-        /// Why.
-        source: DiskError,
-    },
-    /// The folder of the missions cannot be created.
-    #[error("--data {}: {source}", path.display())]
-    Data {
-        /// The folder.
-        path: PathBuf,
-        /// The error of the system.
-        source: std::io::Error,
-    },
-    /// The certificates.
-    #[error("tls: {0}")]
-    Tls(#[from] TlsError),
-    /// The server.
-    #[error("the commander's server failed: {0}")]
-    Transport(#[from] tonic::transport::Error),
-    /// The descriptors.
-    #[error("the commander's reflection service cannot be built: {0}")]
-    Reflection(#[from] server::ReflectionError),
-}
-
 /// Serves until `shutdown`, then drains for `config.drain` and returns within [`server::GRACE`] more. The health is SERVING once
 /// a model is loaded, or at once if neither a learner nor weights are configured.
 pub async fn run(
@@ -137,7 +100,7 @@ pub async fn run(
     load_scheduler: LoadScheduler,
     incoming: Incoming,
     shutdown: CancellationToken,
-) -> Result<(), ServeError> {
+) -> Result<(), Failure> {
     let store = Arc::new(ModelStore::new());
     let without_model = config.learner_url.is_none() && config.weights.is_none();
     let draining = CancellationToken::new();
@@ -145,11 +108,13 @@ pub async fn run(
     // Aborted when this function returns.
     let mut helpers = JoinSet::new();
     if let Some(file) = config.weights {
-        let loaded = file.first(&store, load_scheduler).await?;
+        let loaded =
+            file.first(&store, load_scheduler).await.map_err(|error| Failure::usage(format!("weights: {error}")))?;
         helpers.spawn(file.follow(loaded, store.clone(), load_scheduler));
     }
     if let Some(url) = &config.learner_url {
-        helpers.spawn(subscription::follow(config.client.lazy_channel(url)?, store.clone(), load_scheduler));
+        let channel = config.client.lazy_channel(url).map_err(|error| Failure::usage(format!("learner: {error}")))?;
+        helpers.spawn(subscription::follow(channel, store.clone(), load_scheduler));
     }
     let metrics = Arc::new(CommanderMetrics::new(&config.metrics));
     let answering = AssignService::new(store.clone(), metrics.clone());
@@ -161,8 +126,7 @@ pub async fn run(
             tokio::time::sleep(SWEEP).await;
         }
     });
-    refresh_before_scrape(&config.metrics, &metrics, &store, &missions, &in_flight, &answering);
-    let api = CommanderApi {
+    let api = Arc::new(CommanderApi {
         store: store.clone(),
         shards: ShardAssign::new(store.clone(), answering.clone()),
         answering,
@@ -170,19 +134,34 @@ pub async fn run(
         in_flight: in_flight.clone(),
         limits: config.limits,
         draining: draining.clone(),
-    };
+    });
+    let weak = Arc::downgrade(&api);
+    config.metrics.before_scrape(move || {
+        if let Some(api) = weak.upgrade() {
+            api.refresh_gauges();
+        }
+    });
     let (health, health_service) = Health::new::<CommanderServiceServer<CommanderApi>>().await;
-    let service = CommanderServiceServer::new(api)
+    let service = CommanderServiceServer::from_arc(api)
         .max_decoding_message_size(config.message_bytes)
         .max_encoding_message_size(config.message_bytes.max(MAX_BATCH_BYTES));
     let Security { tls, access } = config.security;
     let connections = incoming.connections();
-    let rules = Rules { access, in_flight: in_flight.clone(), streams: STREAMS, message_bytes: config.message_bytes };
-    let guarded = Guard::guarded(WithDeadline::new(service), rules, connections.clone());
-    let router = server::secure_builder(tls.as_ref())?
+    let rules = Rules {
+        access,
+        in_flight: in_flight.clone(),
+        streams: STREAMS,
+        message_bytes: config.message_bytes,
+        calls: Some(metrics.calls.clone()),
+    };
+    let internal =
+        |what: &str, error: &dyn Display| Failure::new(exit::INTERNAL, format!("the commander's {what}: {error}"));
+    let router = server::secure_builder(tls.as_ref())
+        .map_err(|error| Failure::usage(format!("tls: {error}")))?
         .add_service(Guard::public(health_service, connections.clone()))
-        .add_service(Counted::new(guarded, metrics.calls.clone()));
-    let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
+        .add_service(Guard::guarded(service, rules, connections.clone()));
+    let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)
+        .map_err(|error| internal("reflection service cannot be built", &error))?;
     let closed = CancellationToken::new();
     let (stop, closing, drain) = (shutdown, closed.clone(), config.drain);
     helpers.spawn(async move {
@@ -200,44 +179,27 @@ pub async fn run(
     let served = server::serve(router, incoming, closed, server::GRACE).await;
     helpers.abort_all();
     // Dropped connections may keep the service alive for a while, but another commander may need the file.
-    let _ = tokio::task::spawn_blocking(move || closer.close()).await;
-    Ok(served?)
+    let _ = tokio::task::spawn_blocking(move || closer.missions.close()).await;
+    served.map_err(|error| internal("server failed", &error))
 }
 
-/// Sets the gauges that are computed on demand before every scrape, for as long as the service exists.
-fn refresh_before_scrape(
-    registry: &Metrics,
-    metrics: &Arc<CommanderMetrics>,
-    store: &Arc<ModelStore>,
-    missions: &Arc<MissionService>,
-    in_flight: &Arc<InFlight>,
-    answering: &Arc<AssignService>,
-) {
-    let metrics = metrics.clone();
-    let weak = (Arc::downgrade(store), Arc::downgrade(missions), Arc::downgrade(in_flight), Arc::downgrade(answering));
-    registry.before_scrape(move || {
-        let alive = (weak.0.upgrade(), weak.1.upgrade(), weak.2.upgrade(), weak.3.upgrade());
-        let (Some(store), Some(missions), Some(in_flight), Some(answering)) = alive else { return };
-        metrics.in_flight.set(in_flight.count(CallKind::Call) as f64);
-        metrics.streams.set(in_flight.count(CallKind::Stream) as f64);
-        metrics.missions.set(missions.count() as f64);
-        metrics.backlog.set(missions.backlog() as f64);
-        metrics.weights_version.set(store.latest().map_or(-1.0, |(key, _)| f64::from(key.version.0)));
-        metrics.free_processors.set(answering.free_processors() as f64);
-    });
-}
-
-async fn open_missions(data: Option<PathBuf>, bounds: Bounds) -> Result<Missions, ServeError> {
-    let Some(folder) = data else {
-        tracing::debug!("no --data folder: missions are lost when the process ends");
-        return Missions::open(None, bounds).map_err(|source| ServeError::Missions { path: PathBuf::new(), source });
+/// Opens the file of the missions on a thread that may block.
+async fn open_missions(data: Option<PathBuf>, bounds: Bounds) -> Result<Missions, Failure> {
+    let cannot = |what: &str, path: &Path, error: &dyn Display| {
+        Failure::new(exit::CANNOT_CREATE, format!("{what} {}: {error}", path.display()))
     };
-    std::fs::create_dir_all(&folder).map_err(|source| ServeError::Data { path: folder.clone(), source })?;
-    let path = folder.join(MISSIONS);
-    let file = path.clone();
-    let opening = tokio::task::spawn_blocking(move || Missions::open(Some(Disk::open(&file)?), bounds));
-    match opening.await {
-        Ok(opened) => opened.map_err(|source| ServeError::Missions { path, source }),
-        Err(error) => Err(ServeError::Data { path, source: std::io::Error::other(error) }),
-    }
+    let path = match &data {
+        Some(folder) => {
+            std::fs::create_dir_all(folder).map_err(|error| cannot("--data", folder, &error))?;
+            folder.join(MISSIONS)
+        }
+        None => {
+            tracing::debug!("no --data folder: missions are lost when the process ends");
+            PathBuf::new()
+        }
+    };
+    let file = data.map(|_| path.clone());
+    let open = move || Missions::open(file.as_deref().map(Disk::open).transpose()?, bounds);
+    let opened = tokio::task::spawn_blocking(open).await.map_err(|error| cannot("--data", &path, &error))?;
+    opened.map_err(|error| cannot("missions in", &path, &error))
 }

@@ -2,10 +2,11 @@
 
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
-use crate::cancel::CancelOnDrop;
+use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::model_store::ModelStore;
-use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, WeightsKey};
+use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
+use magex_core::error::FieldError;
 use magex_dispatch::Limits;
 use magex_runtime::status;
 use std::sync::Arc;
@@ -28,7 +29,6 @@ const RUN_ID: usize = 128;
 const SHA256: usize = 64;
 
 /// Answers shards.
-#[derive(Debug)]
 pub(crate) struct ShardAssign {
     store: Arc<ModelStore>,
     answering: Arc<AssignService>,
@@ -42,7 +42,8 @@ impl ShardAssign {
         Self { store, answering, threads }
     }
 
-    /// Answers a shard with the weights that it names, once they have arrived; and the method of their scheduler.
+    /// Answers a shard on a worker thread, for as long as the call waits, with the weights that it names, once they have arrived.
+    /// Returns the method of their scheduler, too.
     pub(crate) async fn answer(
         &self,
         request: Arc<GoalRequest>,
@@ -56,22 +57,10 @@ impl ShardAssign {
             let problem = format!("weights version {version} of run '{run}' have not arrived; retry later");
             return Err(status::unavailable(problem, Duration::from_millis(500)));
         };
-        match model.scheduler {
-            Ok(scheduler) => {
-                let method = scheduler.method();
-                Ok((self.solve(request, scheduler, budget).await?, method))
-            }
-            Err(reason) => Err(status::failed_precondition(format!("weights version {}: {reason}", key.version))),
-        }
-    }
-
-    /// Runs the scheduler on a worker thread, for as long as the call waits.
-    async fn solve(
-        &self,
-        request: Arc<GoalRequest>,
-        scheduler: Arc<dyn Scheduler>,
-        budget: CallBudget,
-    ) -> Result<GoalReply, Status> {
+        let refused =
+            |reason: String| status::failed_precondition(format!("weights version {}: {reason}", key.version));
+        let scheduler = model.scheduler.map_err(refused)?;
+        let method = scheduler.method();
         let cells = request.agent_count.max(request.goal_count).pow(2);
         let places = async {
             let thread = self.threads.clone().acquire_owned().await.ok()?;
@@ -80,42 +69,30 @@ impl ShardAssign {
         let Ok(Some(places)) = tokio::time::timeout(QUEUE_TIMEOUT.min(budget.left()), places).await else {
             return Err(status::resource_exhausted("all threads are busy with other shards", Duration::from_secs(1)));
         };
-        let cancel = CancelOnDrop::default();
-        let work = cancel.work(budget);
-        let solving = tokio::task::spawn_blocking(move || {
-            let _held = places;
-            scheduler.assign_batch(&request, &|| work.should_continue())
-        });
-        solving.await.map_err(|error| Status::internal(error.to_string()))?.map_err(to_status)
+        let solve = move |work: &Work| scheduler.assign_batch(&request, &|| work.should_continue());
+        Ok((on_thread(places, budget, solve).await?.map_err(to_status)?, method))
     }
 }
 
 /// Rejects requests of unbounded memory or time. The lengths of the arrays bound the rest.
-pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) -> Result<(), Status> {
+pub(crate) fn check(request: &GoalRequest, key: &WeightsKey, limits: &Limits) -> Result<(), FieldError> {
     let (n, g) = (request.agent_count, request.goal_count);
     for (field, found, most) in [
         ("agents.shape[2]", n, limits.members),
         ("goals.shape[2]", g, limits.members),
         ("agents.shape[3]", request.dims, 3),
     ] {
-        if found == 0 || found > most {
-            return Err(status::invalid_argument(field, format!("{found} is outside 1..={most}")));
-        }
+        let ok = (1..=most).contains(&found);
+        FieldError::ensure(ok, || (field, format!("{found} is outside 1..={most}")))?;
     }
     let teams = (request.shard.episodes as usize).saturating_mul(request.stages);
-    if teams > TEAMS {
-        return Err(status::invalid_argument("agents.shape", format!("{teams} teams exceed the limit of {TEAMS}")));
-    }
-    let pairs = teams.saturating_mul(n).saturating_mul(g);
-    if pairs > PAIRS {
-        let problem =
-            format!("{teams} teams of {n} agents and {g} goals exceed the limit of {PAIRS} pairs; send fewer teams");
-        return Err(status::invalid_argument("agents.shape", problem));
-    }
+    FieldError::ensure(teams <= TEAMS, || ("agents.shape", format!("{teams} teams exceed the limit of {TEAMS}")))?;
+    FieldError::ensure(teams.saturating_mul(n).saturating_mul(g) <= PAIRS, || {
+        let size = format!("{teams} teams of {n} agents and {g} goals");
+        ("agents.shape", format!("{size} exceed the limit of {PAIRS} pairs; send fewer teams"))
+    })?;
     for (field, length, most) in [("run_id", key.run_id.0.len(), RUN_ID), ("sha256", key.sha256.len(), SHA256)] {
-        if length > most {
-            return Err(status::invalid_argument(field, format!("{length} bytes exceed the limit of {most}")));
-        }
+        FieldError::ensure(length <= most, || (field, format!("{length} bytes exceed the limit of {most}")))?;
     }
     Ok(())
 }
@@ -161,9 +138,9 @@ mod tests {
             (GoalRequest { agent_count: 5000, goal_count: 5000, ..good.clone() }, "the limit of 64000000 pairs"),
         ] {
             let refused = check(&request, &key, &limits).unwrap_err();
-            assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(words), "{refused}");
+            assert!(refused.to_string().contains(words), "{refused}");
         }
         let long = WeightsKey { run_id: RunId("r".repeat(129)), ..key };
-        assert!(check(&good, &long, &limits).unwrap_err().message().starts_with("run_id"));
+        assert!(check(&good, &long, &limits).unwrap_err().field.starts_with("run_id"));
     }
 }

@@ -8,9 +8,7 @@ use magex_proto::goals::{GoalReply, GoalRequest};
 
 /// Assigns the goals of every stage of every episode of a shard. Random choices are keyed by (seed, shard, episode).
 /// `random_assignment_fraction` of the training episodes get a random matching, whatever the scheduler.
-///
-/// # Errors
-/// Arrays that do not match the sizes; `Interrupted` if `should_continue`, which is called before every team, returns false.
+/// `should_continue` is called before every team.
 pub fn answer(
     commander: &Commander,
     random_assignment_fraction: f32,

@@ -20,7 +20,7 @@ use tonic::{Status, Streaming};
 use tonic_types::StatusExt as _;
 
 /// Capacity of the queue of answers to a client.
-const AHEAD: usize = 2;
+pub(crate) const AHEAD: usize = 2;
 /// A client that does not read for this time loses its stream.
 const READ_TIMEOUT: Duration = Duration::from_secs(60);
 /// Assignments of a snapshot that are fetched together.
@@ -106,6 +106,9 @@ impl Interest {
     }
 }
 
+/// (Time of creation, revision) of the missions that a watcher has received, by name.
+type Sent = HashMap<String, (i64, u64)>;
+
 type Watcher = mpsc::Sender<Result<v1::WatchAssignmentsResponse, Status>>;
 
 /// Sends a watcher a snapshot, then every change, until it cancels or the service drains.
@@ -116,9 +119,10 @@ pub(crate) async fn watch(
     draining: CancellationToken,
 ) {
     // Subscribes first, so that no change during the snapshot is missed.
-    let mut events = missions.events();
-    let Some(mut sent) = snapshot(&missions, &interest, &watcher).await else { return };
-    loop {
+    let mut events = missions.events.subscribe();
+    let mut sent = Sent::new();
+    let mut open = snapshot(&missions, &interest, &watcher, &mut sent).await;
+    while open.is_some() {
         let event = tokio::select! {
             event = events.recv() => event,
             () = watcher.closed() => break,
@@ -128,33 +132,21 @@ pub(crate) async fn watch(
                 break;
             }
         };
-        let alive = match event {
+        open = match event {
             Ok(event) => publish(&interest, &watcher, &mut sent, event).await,
             Err(RecvError::Lagged(missed)) => {
                 tracing::debug!(missed, watcher = &*interest.caller.name, "a slow watcher gets a new snapshot");
-                match snapshot(&missions, &interest, &watcher).await {
-                    Some(now) => {
-                        sent = now;
-                        true
-                    }
-                    None => false,
-                }
+                snapshot(&missions, &interest, &watcher, &mut sent).await
             }
-            Err(RecvError::Closed) => false,
+            Err(RecvError::Closed) => None,
         };
-        if !alive {
-            break;
-        }
     }
 }
 
-/// Sends the current assignments. Returns the revisions sent, or `None` if the watcher has cancelled.
-async fn snapshot(
-    missions: &MissionService,
-    interest: &Interest,
-    watcher: &Watcher,
-) -> Option<HashMap<String, (i64, u64)>> {
-    let (mut sent, mut after) = (HashMap::new(), String::new());
+/// Sends the current assignments and remembers their revisions. Returns `None` if the watcher has cancelled.
+async fn snapshot(missions: &MissionService, interest: &Interest, watcher: &Watcher, sent: &mut Sent) -> Option<()> {
+    sent.clear();
+    let mut after = String::new();
     loop {
         let (page, _) = missions.after(&interest.caller, &after, PAGE, interest.source);
         let Some(last) = page.last() else { break };
@@ -164,50 +156,41 @@ async fn snapshot(
             send(watcher, v1::WatchKind::Snapshot, Some(assignment)).await?;
         }
     }
-    send(watcher, v1::WatchKind::Synced, None).await?;
-    Some(sent)
+    send(watcher, v1::WatchKind::Synced, None).await
 }
 
-async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut HashMap<String, (i64, u64)>, event: Event) -> bool {
+/// Sends an event if the watcher wants it and has not got it with a snapshot. Returns `None` if the watcher has cancelled.
+async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut Sent, event: Event) -> Option<()> {
     match event {
-        Event::Mission(kind, mission) => {
+        Event::Mission(kind, mission) if passes(interest.source, v1::MissionSource::Client) => {
             let a = &mission.assignment;
             // The last event of a deleted or expired mission is still visible to its owner.
             let now = if kind == v1::WatchKind::Changed { now_ms() } else { i64::MIN };
-            let wanted = passes(interest.source, v1::MissionSource::Client) && interest.wants(&a.mission_id);
-            if !wanted || !visible(&interest.caller, &mission, now) {
-                return true;
+            if !interest.wants(&a.mission_id) || !visible(&interest.caller, &mission, now) {
+                return Some(());
             }
+            let revision = (a.created_ms, a.revision);
             match kind {
                 // Older than the snapshot.
-                v1::WatchKind::Changed if sent.get(&a.mission_id).is_some_and(|&t| t >= (a.created_ms, a.revision)) => {
-                    return true;
+                v1::WatchKind::Changed if sent.get(&a.mission_id).is_some_and(|&last| last >= revision) => {
+                    return Some(());
                 }
-                v1::WatchKind::Changed => drop(sent.insert(a.mission_id.clone(), (a.created_ms, a.revision))),
+                v1::WatchKind::Changed => drop(sent.insert(a.mission_id.clone(), revision)),
                 _ => drop(sent.remove(&a.mission_id)),
             }
-            send(watcher, kind, Some(a.clone())).await.is_some()
+            send(watcher, kind, Some(a.clone())).await
         }
-        Event::Training(shard) => {
-            if !passes(interest.source, v1::MissionSource::Training) {
-                return true;
-            }
+        Event::Training(shard) if passes(interest.source, v1::MissionSource::Training) => {
             for assignment in shard.assignments().filter(|a| interest.wants(&a.mission_id)) {
-                if send(watcher, v1::WatchKind::Changed, Some(assignment)).await.is_none() {
-                    return false;
-                }
+                send(watcher, v1::WatchKind::Changed, Some(assignment)).await?;
             }
-            true
+            Some(())
         }
+        _ => Some(()),
     }
 }
 
 async fn send(watcher: &Watcher, kind: v1::WatchKind, assignment: Option<v1::Assignment>) -> Option<()> {
     let message = v1::WatchAssignmentsResponse { kind: kind.into(), assignment };
     watcher.send_timeout(Ok(message), READ_TIMEOUT).await.ok()
-}
-
-/// A channel of answers to a client.
-pub(crate) fn channel<T>() -> (mpsc::Sender<T>, mpsc::Receiver<T>) {
-    mpsc::channel(AHEAD)
 }

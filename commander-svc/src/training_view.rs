@@ -1,11 +1,15 @@
 //! The assignments of recent training episodes, as read-only missions.
 
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
+use magex_assign::pairs;
 use magex_core::ids::ShardKind;
-use magex_dispatch::view;
+use magex_dispatch::engine::Plan;
+use magex_dispatch::mission::TRAINING_PREFIX;
+use magex_dispatch::{Problem, answer};
 use magex_proto::v1;
+use magex_runtime::sync::lock;
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Maximum number of shards, and of numbers in them.
 const SHARDS: usize = 256;
@@ -19,7 +23,7 @@ const LIVE_MS: i64 = 600_000;
 #[derive(Debug)]
 pub(crate) struct TrainingShard {
     pub(crate) request: Arc<GoalRequest>,
-    pub(crate) reply: Arc<GoalReply>,
+    pub(crate) reply: GoalReply,
     pub(crate) key: WeightsKey,
     /// The method of the run's scheduler.
     pub(crate) method: AssignmentMethod,
@@ -40,42 +44,82 @@ impl TrainingShard {
 
     /// Names of the missions, in order.
     fn names(&self) -> impl Iterator<Item = String> + '_ {
-        let prefix = format!("{}{}", magex_dispatch::mission::TRAINING_PREFIX, self.key.run_id);
-        (0..self.missions()).map(move |place| {
-            let (part, episode) = (self.part(place % self.request.stages), place / self.request.stages);
-            format!("{prefix}.{part}.{}", self.request.shard.first_episode + episode as u32)
+        (0..self.missions()).map(|place| {
+            let (part, episode) = self.part_and_episode(place);
+            format!("{TRAINING_PREFIX}{}.{part}.{episode}", self.key.run_id)
         })
     }
 
-    fn part(&self, stage: usize) -> String {
-        let part = match self.request.shard.kind {
-            ShardKind::Train => format!("train-{}", self.request.shard.iteration),
-            ShardKind::Eval => format!("eval-{}", self.request.shard.eval_set),
+    fn part_and_episode(&self, place: usize) -> (String, u32) {
+        let (shard, stages) = (&self.request.shard, self.request.stages);
+        let mut part = match shard.kind {
+            ShardKind::Train => format!("train-{}", shard.iteration),
+            ShardKind::Eval => format!("eval-{}", shard.eval_set),
         };
-        if self.request.stages > 1 { format!("{part}-stage-{stage}") } else { part }
+        if stages > 1 {
+            part += &format!("-stage-{}", place % stages);
+        }
+        (part, shard.first_episode + (place / stages.max(1)) as u32)
     }
 
-    fn assignment(&self, place: usize) -> Option<v1::Assignment> {
-        let (request, reply) = (&*self.request, &*self.reply);
+    /// One stage of one episode; `None` if its arrays are inconsistent.
+    pub(crate) fn assignment(&self, place: usize) -> Option<v1::Assignment> {
+        let (request, reply) = (&*self.request, &self.reply);
         let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
-        let part = self.part(place % request.stages.max(1));
-        let episode = view::Episode {
-            run_id: &self.key.run_id.0,
-            part: &part,
-            index: request.shard.first_episode + (place / request.stages.max(1)) as u32,
-            dims: d,
-            agents: request.agents.get(place * n * d..(place + 1) * n * d)?,
-            goals: request.goals.get(place * g * d..(place + 1) * g * d)?,
-            goal_of: reply.goals.get(place * n..(place + 1) * n)?,
-            scheduler: self.method,
-            version: self.key.version.0,
-            sha256: &self.key.sha256,
-            cost: f64::from(*reply.costs.get(place)?),
-            exact_cost: f64::from(*reply.exact_costs.get(place)?),
-            at_ms: self.at_ms,
-            expires_ms: self.at_ms + LIVE_MS,
+        let points =
+            |values: &[f32], count: usize| Some(values.get(place * count * d..(place + 1) * count * d)?.to_vec());
+        let named = |side: &str, count: usize| (0..count).map(|k| format!("{side}-{k}")).collect();
+        let problem = Problem {
+            agent_ids: named("agent", n),
+            goal_ids: named("goal", g),
+            ..Problem::of_points(points(&request.agents, n)?, points(&request.goals, g)?, d)
         };
-        Some(episode.assignment())
+        let goal_of = reply.goals.get(place * n..(place + 1) * n)?.to_vec();
+        if pairs(&goal_of).any(|(_, goal)| goal >= g) {
+            return None;
+        }
+        let mut pair_costs = vec![0.0; n];
+        pairs(&goal_of).for_each(|(agent, goal)| pair_costs[agent] = problem.distance(agent, goal));
+        let plan = Plan {
+            goal_of,
+            scheduler: self.method,
+            cost: f64::from(*reply.costs.get(place)?),
+            exact_cost: Some(f64::from(*reply.exact_costs.get(place)?)),
+            pair_costs,
+            ..Plan::default()
+        };
+        let answer = answer::write(&problem, &plan);
+        let members = |ids: Vec<String>, positions: &[f32]| {
+            let state = v1::MemberState::Active.into();
+            let member = |(id, position): (String, &[f32])| v1::Member { id, position: position.to_vec(), state };
+            ids.into_iter().zip(positions.chunks_exact(d.max(1))).map(member).collect()
+        };
+        let (part, episode) = self.part_and_episode(place);
+        let run_id = self.key.run_id.0.clone();
+        Some(v1::Assignment {
+            mission_id: format!("{TRAINING_PREFIX}{run_id}.{part}.{episode}"),
+            title: format!("{part} episode {episode} of run {run_id}"),
+            source: v1::MissionSource::Training.into(),
+            revision: 1,
+            agents: members(problem.agent_ids, &problem.agents),
+            goals: members(problem.goal_ids, &problem.goals),
+            pairs: answer.pairs,
+            agents_without_goal: answer.agents_without_goal,
+            goals_without_agent: answer.goals_without_agent,
+            largest_cost: answer.largest_cost,
+            cost: answer.cost,
+            exact_cost: answer.exact_cost,
+            gap: answer.gap,
+            scheduler: answer.scheduler,
+            answered_by: answer.scheduler,
+            version: self.key.version.0,
+            sha256: self.key.sha256.clone(),
+            run_id,
+            created_ms: self.at_ms,
+            updated_ms: self.at_ms,
+            expires_ms: self.at_ms + LIVE_MS,
+            ..Default::default()
+        })
     }
 
     fn numbers(&self) -> usize {
@@ -84,20 +128,8 @@ impl TrainingShard {
     }
 }
 
-/// One stage of one episode of a shard.
-#[derive(Debug)]
-pub(crate) struct Episode {
-    pub(crate) name: String,
-    shard: Arc<TrainingShard>,
-    place: usize,
-}
-
-impl Episode {
-    /// As a mission.
-    pub(crate) fn assignment(&self) -> Option<v1::Assignment> {
-        self.shard.assignment(self.place)
-    }
-}
+/// One stage of one episode: its name, its shard, and its place there.
+pub(crate) type Episode = (String, Arc<TrainingShard>, usize);
 
 /// The latest shards.
 #[derive(Debug, Default)]
@@ -108,7 +140,7 @@ pub(crate) struct TrainingView {
 impl TrainingView {
     /// Adds a shard; the oldest are dropped at the limits.
     pub(crate) fn insert(&self, shard: Arc<TrainingShard>) {
-        let mut shards = self.lock();
+        let mut shards = lock(&self.shards);
         // A repeated request of an actor gets the same answer: it is the same mission.
         shards.retain(|old| old.request.shard != shard.request.shard || old.key.run_id != shard.key.run_id);
         shards.push_back(shard);
@@ -120,7 +152,7 @@ impl TrainingView {
 
     /// Shards that are still live at `now` (milliseconds since 1970), oldest first.
     pub(crate) fn live(&self, now: i64) -> Vec<Arc<TrainingShard>> {
-        let mut shards = self.lock();
+        let mut shards = lock(&self.shards);
         shards.retain(|shard| shard.at_ms + LIVE_MS > now);
         shards.iter().cloned().collect()
     }
@@ -145,10 +177,6 @@ impl TrainingView {
         names.sort_unstable();
         names.dedup_by(|a, b| a.0 == b.0);
         names.truncate(count);
-        names.into_iter().map(|(name, k, place)| Episode { name, shard: shards[k].clone(), place }).collect()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<TrainingShard>>> {
-        self.shards.lock().unwrap_or_else(PoisonError::into_inner)
+        names.into_iter().map(|(name, k, place)| (name, shards[k].clone(), place)).collect()
     }
 }

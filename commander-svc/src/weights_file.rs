@@ -4,6 +4,8 @@ use crate::model_store::{Model, ModelStore};
 use crate::scheduler::{LoadScheduler, WeightsKey};
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::weights::sha256_hex;
+use magex_runtime::exit::Failure;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -23,18 +25,9 @@ pub struct WeightsFile {
     name: String,
 }
 
-/// Weights that are unusable.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{path}: {problem}")]
-pub struct WeightsError {
-    path: String,
-    problem: String,
-}
-
-impl WeightsError {
-    fn new(path: &Path, problem: impl ToString) -> Self {
-        Self { path: path.display().to_string(), problem: problem.to_string() }
-    }
+/// A file that is unusable.
+fn unusable(path: &Path, problem: impl Display) -> Failure {
+    Failure::usage(format!("{}: {problem}", path.display()))
 }
 
 /// Modification time and size of both files; when it differs they are read.
@@ -44,11 +37,8 @@ type Stamp = [(SystemTime, u64); 2];
 type Content = [String; 2];
 
 impl WeightsFile {
-    /// A run folder, or a weights file with the configuration given or beside it.
-    ///
-    /// # Errors
-    /// A file is missing.
-    pub fn find(path: &Path, config: Option<&Path>) -> Result<Self, WeightsError> {
+    /// A run folder, or a weights file with the configuration given or beside it. Both must exist.
+    pub fn find(path: &Path, config: Option<&Path>) -> Result<Self, Failure> {
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         let (weights, beside) = if path.is_dir() {
             (path.join(WEIGHTS), path.join(CONFIG))
@@ -57,22 +47,25 @@ impl WeightsFile {
         };
         let config = config.map_or(beside, Path::to_owned);
         if !weights.is_file() {
-            return Err(WeightsError::new(
-                &weights,
-                "no such file; give the folder of a finished run, or its weights file",
-            ));
+            return Err(unusable(&weights, "no such file; give the folder of a finished run, or its weights file"));
         }
         if !config.is_file() {
-            return Err(WeightsError::new(&config, "no such file; give the run's configuration with --config"));
+            return Err(unusable(&config, "no such file; give the run's configuration with --config"));
         }
         Ok(Self { weights, config, name })
     }
 
-    /// Reads both files and loads the model. Returns their hashes, too, to detect a change of content.
-    fn load(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), WeightsError> {
-        let bytes = std::fs::read(&self.weights).map_err(|error| WeightsError::new(&self.weights, error))?;
-        let toml = std::fs::read_to_string(&self.config).map_err(|error| WeightsError::new(&self.config, error))?;
-        let scheduler = load_scheduler(&bytes, &toml).map_err(|error| WeightsError::new(&self.weights, error))?;
+    /// Reads both files and loads the model, on a thread that may block. Returns their hashes, too, to detect a change of content.
+    async fn load(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), Failure> {
+        let own = self.clone();
+        let loading = tokio::task::spawn_blocking(move || own.load_here(version, load_scheduler));
+        loading.await.map_err(|error| unusable(&self.weights, error))?
+    }
+
+    fn load_here(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), Failure> {
+        let bytes = std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, error))?;
+        let toml = std::fs::read_to_string(&self.config).map_err(|error| unusable(&self.config, error))?;
+        let scheduler = load_scheduler(&bytes, &toml).map_err(|error| unusable(&self.weights, error))?;
         let (run_id, sha256) = (RunId(self.name.clone()), sha256_hex(&bytes));
         let content = [sha256.clone(), sha256_hex(toml.as_bytes())];
         let key = Arc::new(WeightsKey { run_id, version: WeightsVersion(version), sha256 });
@@ -89,14 +82,9 @@ impl WeightsFile {
     }
 
     /// Loads the model for the first time.
-    pub(crate) async fn first(
-        &self,
-        store: &ModelStore,
-        load_scheduler: LoadScheduler,
-    ) -> Result<Loaded, WeightsError> {
-        let (own, stamp) = (self.clone(), self.stamp());
-        let load = tokio::task::spawn_blocking(move || own.load(0, load_scheduler));
-        let (model, content) = load.await.map_err(|error| WeightsError::new(&self.weights, error))??;
+    pub(crate) async fn first(&self, store: &ModelStore, load_scheduler: LoadScheduler) -> Result<Loaded, Failure> {
+        let stamp = self.stamp();
+        let (model, content) = self.load(0, load_scheduler).await?;
         let sha256 = &model.key.sha256;
         tracing::info!(weights = %self.weights.display(), sha256, "a model is ready");
         store.insert(model);
@@ -113,9 +101,7 @@ impl WeightsFile {
             if stamp.is_none() || stamp == loaded.stamp {
                 continue;
             }
-            let own = self.clone();
-            let load = tokio::task::spawn_blocking(move || own.load(version + 1, load_scheduler));
-            match load.await.map_err(|error| WeightsError::new(&self.weights, error)).and_then(|model| model) {
+            match self.load(version + 1, load_scheduler).await {
                 Ok((_, content)) if content == loaded.content => loaded.stamp = stamp,
                 Ok((model, content)) => {
                     version += 1;

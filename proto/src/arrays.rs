@@ -6,20 +6,12 @@ use magex_core::error::FieldError;
 
 /// An f32 array of the given shape.
 pub fn from_f32(shape: &[usize], values: &[f32]) -> Array {
-    let mut data = vec![0u8; values.len() * 4];
-    for (slot, value) in data.chunks_exact_mut(4).zip(values) {
-        slot.copy_from_slice(&value.to_le_bytes());
-    }
-    array(DataType::F32, shape, data)
+    array(DataType::F32, shape, bytes(values, f32::to_le_bytes))
 }
 
 /// A u32 array of the given shape.
 pub fn from_u32(shape: &[usize], values: &[u32]) -> Array {
-    let mut data = vec![0u8; values.len() * 4];
-    for (slot, value) in data.chunks_exact_mut(4).zip(values) {
-        slot.copy_from_slice(&value.to_le_bytes());
-    }
-    array(DataType::U32, shape, data)
+    array(DataType::U32, shape, bytes(values, u32::to_le_bytes))
 }
 
 /// A u8 array of the given shape.
@@ -30,13 +22,13 @@ pub fn from_u8(shape: &[usize], values: &[u8]) -> Array {
 /// The numbers of an f32 array that must have exactly this shape.
 pub fn to_f32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f32>, FieldError> {
     let data = checked(field, array, DataType::F32, shape, 4)?;
-    Ok(data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+    Ok(data.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
 }
 
 /// The numbers of a u32 array that must have exactly this shape.
 pub fn to_u32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u32>, FieldError> {
     let data = checked(field, array, DataType::U32, shape, 4)?;
-    Ok(data.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+    Ok(data.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect())
 }
 
 /// The numbers of a u8 array that must have exactly this shape.
@@ -44,22 +36,36 @@ pub fn to_u8(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<u
     checked(field, array, DataType::U8, shape, 1).map(|data| data.to_vec())
 }
 
+/// Numbers that must be finite; the error names the first one that is not.
+pub fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, FieldError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
+        None => Ok(values),
+    }
+}
+
 /// The shape of an array, which must have at most `axes` axes.
 pub fn shape_up_to(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;
-    if array.shape.len() > axes {
-        return Err(FieldError::new(field, format!("a shape of {} axes, at most {axes} are known", array.shape.len())));
-    }
+    let found = array.shape.len();
+    FieldError::ensure(found <= axes, || (field, format!("a shape of {found} axes, at most {axes} are known")))?;
     Ok(array.shape.iter().map(|&extent| extent as usize).collect())
 }
 
 /// The shape of an array, which must have exactly `axes` axes.
 pub fn shape_of(field: &str, array: Option<&Array>, axes: usize) -> Result<Vec<usize>, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;
-    if array.shape.len() != axes {
-        return Err(FieldError::new(field, format!("its shape has {} axes, not {axes}", array.shape.len())));
-    }
+    let found = array.shape.len();
+    FieldError::ensure(found == axes, || (field, format!("its shape has {found} axes, not {axes}")))?;
     shape_up_to(field, Some(array), axes)
+}
+
+fn bytes<T: Copy>(values: &[T], encode: impl Fn(T) -> [u8; 4]) -> Vec<u8> {
+    let mut data = vec![0u8; values.len() * 4];
+    for (slot, value) in data.as_chunks_mut().0.iter_mut().zip(values) {
+        *slot = encode(*value);
+    }
+    data
 }
 
 fn array(kind: DataType, shape: &[usize], data: Vec<u8>) -> Array {
@@ -75,12 +81,10 @@ fn checked(
     size: usize,
 ) -> Result<Bytes, FieldError> {
     let array = array.ok_or_else(|| FieldError::missing(field))?;
-    if array.r#type() != kind {
-        return Err(FieldError::new(
-            field,
-            format!("type {} where {} is expected", array.r#type().as_str_name(), kind.as_str_name()),
-        ));
-    }
+    let found = array.r#type();
+    FieldError::ensure(found == kind, || {
+        (field, format!("type {} where {} is expected", found.as_str_name(), kind.as_str_name()))
+    })?;
     if !array.shape.iter().map(|&extent| extent as usize).eq(shape.iter().copied()) {
         // A shape of a million axes is not repeated to its sender.
         let found = match array.shape.len() {
@@ -90,9 +94,8 @@ fn checked(
         return Err(FieldError::new(field, format!("{found} where {shape:?} is expected")));
     }
     let expected = shape.iter().try_fold(size, |product, &extent| product.checked_mul(extent));
-    if expected != Some(array.data.len()) {
-        return Err(FieldError::new(field, format!("{} bytes do not fill shape {shape:?}", array.data.len())));
-    }
+    let found = array.data.len();
+    FieldError::ensure(expected == Some(found), || (field, format!("{found} bytes do not fill shape {shape:?}")))?;
     Ok(array.data)
 }
 

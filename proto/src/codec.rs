@@ -106,8 +106,7 @@ fn invalid(field: &str, problem: String) -> Status {
     Status::with_error_details(Code::InvalidArgument, format!("{field}: {problem}"), details)
 }
 
-/// What the decoder says, `…: Inner.field: Outer.field: problem`, as path and problem. prost keeps the path to itself but for
-/// this text.
+/// What the decoder says, `…: Inner.field: Outer.field: problem`, as path and problem: prost shows the path only here.
 fn unreadable(error: &str) -> Status {
     let mut path = Vec::new();
     let mut problem = error.strip_prefix("failed to decode Protobuf message: ").unwrap_or(error);

@@ -16,8 +16,7 @@ pub const BYTES_PER_ELEMENT: usize = 16;
 /// Elements that a team counts as, in a request for several.
 const TEAM: usize = 64;
 
-/// Rejects the bytes of a request of type `T` with too many elements, with the limit. Malformed bytes are left to the decoder, which
-/// stops at the same place.
+/// Rejects a request of type `T` with too many elements, with the limit. Malformed bytes are left to the decoder.
 pub(crate) fn check<T: 'static>(bytes: &[u8]) -> Result<(), usize> {
     let limit = ELEMENTS + bytes.len() / BYTES_PER_ELEMENT;
     let teams = [TypeId::of::<v1::AssignManyRequest>(), TypeId::of::<v1::AssignStreamRequest>()];

@@ -1,10 +1,9 @@
 //! An actor's request to the commander for the goals of a shard, and the reply.
 
-use crate::convert;
-use crate::{arrays, v1};
+use crate::arrays::finite;
+use crate::{arrays, convert, v1};
 use magex_core::error::FieldError;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
-use std::fmt;
 
 /// How goals are assigned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -38,12 +37,6 @@ impl AssignmentMethod {
     }
 }
 
-impl fmt::Display for AssignmentMethod {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 impl From<AssignmentMethod> for v1::AssignmentMethod {
     fn from(kind: AssignmentMethod) -> Self {
         match kind {
@@ -58,13 +51,8 @@ impl From<AssignmentMethod> for v1::AssignmentMethod {
 
 impl From<v1::AssignmentMethod> for AssignmentMethod {
     fn from(kind: v1::AssignmentMethod) -> Self {
-        match kind {
-            v1::AssignmentMethod::Unspecified | v1::AssignmentMethod::Learned => Self::Learned,
-            v1::AssignmentMethod::Exact => Self::Exact,
-            v1::AssignmentMethod::Greedy => Self::Greedy,
-            v1::AssignmentMethod::Random => Self::Random,
-            v1::AssignmentMethod::Makespan => Self::Makespan,
-        }
+        // Learned unless specified.
+        Self::ALL.into_iter().find(|method| v1::AssignmentMethod::from(*method) == kind).unwrap_or_default()
     }
 }
 
@@ -79,8 +67,7 @@ pub struct WeightsKey {
     pub sha256: String,
 }
 
-/// The teams of one shard. Random choices are keyed by (seed, shard), so that the reply is a pure function of the request and
-/// the weights that `shard.version` names.
+/// The teams of one shard. The reply is a pure function of it and of the weights that `shard.version` names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GoalRequest {
     /// The shard: kind, iteration, index, set and first episode are keys; version and mode are instructions.
@@ -128,10 +115,7 @@ impl GoalRequest {
         }
     }
 
-    /// Reads a message: the request, and the weights that it names.
-    ///
-    /// # Errors
-    /// The first field that is invalid. Positions are finite afterwards.
+    /// Reads a message: the request, and the weights that it names. Positions are finite afterwards.
     pub fn from_message(message: v1::AssignBatchRequest) -> Result<(Self, WeightsKey), FieldError> {
         let shard = convert::shard("shard", message.shard.as_ref())?;
         let agent_shape = arrays::shape_of("agents", message.agents.as_ref(), 4)?;
@@ -139,9 +123,7 @@ impl GoalRequest {
         let (b, stages, dims) = (shard.episodes as usize, agent_shape[1], agent_shape[3]);
         let agents = finite("agents", arrays::to_f32("agents", message.agents, &[b, stages, agent_shape[2], dims])?)?;
         let goals = finite("goals", arrays::to_f32("goals", message.goals, &[b, stages, goal_shape[2], dims])?)?;
-        if stages == 0 {
-            return Err(FieldError::new("agents", "0 stages; send at least one assignment problem per episode"));
-        }
+        FieldError::ensure(stages > 0, || ("agents", "0 stages; send at least one assignment problem per episode"))?;
         let (agent_count, goal_count) = (agent_shape[2], goal_shape[2]);
         let version = shard.version;
         let request = Self { shard, seed: message.seed, stages, agent_count, goal_count, dims, agents, goals };
@@ -163,16 +145,12 @@ impl GoalReply {
     }
 
     /// Reads the reply to a request: shapes match, numbers are finite, and goals exist.
-    ///
-    /// # Errors
-    /// The first field that is invalid.
     pub fn from_message(message: v1::AssignBatchResponse, request: &GoalRequest) -> Result<Self, FieldError> {
         let problems = [request.shard.episodes as usize, request.stages];
-        if message.version != request.shard.version.0 {
-            let problem =
-                format!("version {} answered a request to version {}", message.version, request.shard.version);
-            return Err(FieldError::new("version", problem));
-        }
+        let (found, asked) = (message.version, request.shard.version);
+        FieldError::ensure(found == asked.0, || {
+            ("version", format!("version {found} answered a request to version {asked}"))
+        })?;
         let goals = arrays::to_u32("goals", message.goals, &[problems[0], problems[1], request.agent_count])?;
         if let Some(goal) = goals.iter().find(|&&goal| goal as usize >= request.goal_count) {
             return Err(FieldError::new("goals", format!("{goal} is not below {}", request.goal_count)));
@@ -183,13 +161,6 @@ impl GoalReply {
             costs: finite("costs", arrays::to_f32("costs", message.costs, &problems)?)?,
             exact_costs: finite("exact_costs", arrays::to_f32("exact_costs", message.exact_costs, &problems)?)?,
         })
-    }
-}
-
-fn finite(field: &str, values: Vec<f32>) -> Result<Vec<f32>, FieldError> {
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
-        None => Ok(values),
     }
 }
 

@@ -1,7 +1,6 @@
 //! The wire and nothing else: messages, services, and the conversions between them and the domain types.
 //!
-//! Arrays travel as little-endian bytes. A result or a set of weights is cut into parts ([`parts`]) so that no message
-//! comes near [`MAX_MESSAGE_BYTES`].
+//! Arrays travel as little-endian bytes. Results and weights are cut into parts, far below [`MAX_MESSAGE_BYTES`].
 
 pub mod arrays;
 pub mod codec;

@@ -2,42 +2,7 @@
 
 use crate::{PART_BYTES, v1::Part};
 use bytes::Bytes;
-
-/// Why parts cannot be joined.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PartError {
-    /// The byte string exceeds the limit.
-    #[error("total_bytes: {total} bytes are more than the limit of {limit}")]
-    TooLong {
-        /// Announced length, bytes.
-        total: u64,
-        /// Limit, bytes.
-        limit: usize,
-    },
-    /// The parts do not follow each other.
-    #[error("index: part {index} of {total} where part {expected} is expected")]
-    OutOfOrder {
-        /// Index of the part.
-        index: u32,
-        /// Announced number of parts.
-        total: u32,
-        /// Index that was expected.
-        expected: u32,
-    },
-    /// The parts disagree about the total length, or do not fill it.
-    #[error("data: {0}")]
-    Inconsistent(String),
-    /// The data was damaged in transit.
-    #[error("crc32c: part {index} has checksum {actual:08x}, its sender says {claimed:08x}")]
-    Checksum {
-        /// Index of the part.
-        index: u32,
-        /// Checksum of the data that arrived.
-        actual: u32,
-        /// Checksum that the sender gave.
-        claimed: u32,
-    },
-}
+use magex_core::error::FieldError;
 
 /// Splits a byte string into parts of at most [`PART_BYTES`]; an empty one is a single empty part. Shares the bytes.
 pub fn split(whole: Bytes) -> impl ExactSizeIterator<Item = Part> {
@@ -65,8 +30,8 @@ impl Assembler {
         Self { limit, next: 0, total: 0, total_bytes: 0, buffer: Vec::new() }
     }
 
-    /// Adds the next part; the last one returns the byte string.
-    pub fn push(&mut self, part: Part) -> Result<Option<Bytes>, PartError> {
+    /// Adds the next part; the last one returns the byte string. Fails beyond the limit, and if a part is missing or damaged.
+    pub fn push(&mut self, part: Part) -> Result<Option<Bytes>, FieldError> {
         let taken = self.take(part);
         if !matches!(taken, Ok(None)) {
             *self = Self::new(self.limit);
@@ -74,29 +39,34 @@ impl Assembler {
         taken
     }
 
-    fn take(&mut self, part: Part) -> Result<Option<Bytes>, PartError> {
+    fn take(&mut self, part: Part) -> Result<Option<Bytes>, FieldError> {
         if part.index == 0 {
             if part.total_bytes > self.limit as u64 {
-                return Err(PartError::TooLong { total: part.total_bytes, limit: self.limit });
+                let problem = format!("{} bytes are more than the limit of {}", part.total_bytes, self.limit);
+                return Err(FieldError::new("total_bytes", problem));
             }
             *self = Self { total: part.total, total_bytes: part.total_bytes, ..Self::new(self.limit) };
         } else if part.index != self.next {
-            return Err(PartError::OutOfOrder { index: part.index, total: part.total, expected: self.next });
+            let problem = format!("part {} of {} where part {} is expected", part.index, part.total, self.next);
+            return Err(FieldError::new("index", problem));
         }
         if (part.total, part.total_bytes) != (self.total, self.total_bytes) || part.index >= part.total {
-            return Err(PartError::Inconsistent(format!(
+            let problem = format!(
                 "part {} speaks of {} parts and {} bytes, part 0 of {} and {}",
                 part.index, part.total, part.total_bytes, self.total, self.total_bytes
-            )));
+            );
+            return Err(FieldError::new("data", problem));
         }
         let actual = crc32c::crc32c(&part.data);
         if actual != part.crc32c {
-            return Err(PartError::Checksum { index: part.index, actual, claimed: part.crc32c });
+            let problem = format!("part {} has checksum {actual:08x}, its sender says {:08x}", part.index, part.crc32c);
+            return Err(FieldError::new("crc32c", problem));
         }
         let last = part.index + 1 == part.total;
         let length = (self.buffer.len() + part.data.len()) as u64;
         if length > self.total_bytes || (last && length != self.total_bytes) {
-            return Err(PartError::Inconsistent(format!("{length} bytes arrived of {} announced", self.total_bytes)));
+            let problem = format!("{length} bytes arrived of {} announced", self.total_bytes);
+            return Err(FieldError::new("data", problem));
         }
         if last && part.index == 0 {
             return Ok(Some(part.data));
@@ -118,7 +88,7 @@ mod tests {
         (0..length).map(|i| (i * 31 % 251) as u8).collect::<Vec<_>>().into()
     }
 
-    fn join(assembler: &mut Assembler, parts: impl IntoIterator<Item = Part>) -> Result<Option<Bytes>, PartError> {
+    fn join(assembler: &mut Assembler, parts: impl IntoIterator<Item = Part>) -> Result<Option<Bytes>, FieldError> {
         let mut last = Ok(None);
         for part in parts {
             last = assembler.push(part);
@@ -142,7 +112,7 @@ mod tests {
     #[test]
     fn a_whole_over_the_limit_is_refused_at_its_first_part() {
         let error = Assembler::new(100).push(split(whole(101)).next().unwrap()).unwrap_err();
-        assert_eq!(error, PartError::TooLong { total: 101, limit: 100 });
+        assert_eq!(error, FieldError::new("total_bytes", "101 bytes are more than the limit of 100"));
     }
 
     #[test]

@@ -43,9 +43,7 @@ impl WeightsStream {
     }
 
     /// The next version, verified, with the run's configuration (TOML); `None` at the end of the stream.
-    ///
-    /// # Errors
-    /// The stream broke, or the weights arrived damaged: subscribe again.
+    /// After an error, subscribe again.
     pub async fn next(&mut self) -> Result<Option<(Weights, String)>, Status> {
         while let Some(message) = self.stream.message().await? {
             let pushed = self.assembler.push(message);

@@ -104,7 +104,7 @@ fn requests_missions_and_their_records() {
     let limits = magex_dispatch::mission::MissionLimits { members: 16, lifetime_ms: 1000 };
     let planner = |problem: &magex_dispatch::Problem| {
         let plan = magex_dispatch::engine::solve(problem, problem.scheduler, &|| true)?;
-        Ok(magex_dispatch::mission::Planned { plan, fallback_reason: String::new(), weights: None })
+        Ok(magex_dispatch::answer::Planned { plan, fallback_reason: String::new(), weights: None })
     };
     let kept = magex_dispatch::mission::Mission::create(mission(), "me", "", 0, &limits, &planner).unwrap();
     run("record", vec![kept.encode()], 100_000, dispatch::record);

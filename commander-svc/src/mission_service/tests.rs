@@ -36,7 +36,7 @@ fn budget() -> CallBudget {
 
 async fn all_processors(keeper: &MissionService) -> Vec<crate::assign_service::Places> {
     let mut taken = Vec::new();
-    while keeper.answering.free_processors() > 0 {
+    while keeper.answering.processors.available_permits() > 0 {
         taken.push(keeper.answering.places(1, budget().left()).await.unwrap());
     }
     taken
@@ -65,7 +65,7 @@ async fn the_smallest_mission_waits_for_a_processor_too() {
 async fn nothing_is_planned_or_written_for_a_cancelled_call() {
     let keeper = keeper();
     keeper.create(client("me"), request("old", 1, 1), budget()).await.unwrap();
-    let processors = keeper.answering.free_processors();
+    let processors = keeper.answering.processors.available_permits();
     let large = request("new", 1000, 1000);
     let update = v1::UpdateMissionRequest {
         mission_id: "old".into(),
@@ -81,10 +81,10 @@ async fn nothing_is_planned_or_written_for_a_cancelled_call() {
         // The work is on its thread; then the caller cancels, or its deadline passes.
         assert!(call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending());
         drop(call);
-        while keeper.answering.free_processors() < processors {
+        while keeper.answering.processors.available_permits() < processors {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
-        assert_eq!(keeper.count(), 1);
+        assert_eq!(keeper.missions.count(), 1);
         assert_eq!(keeper.get(&client("me"), "old").unwrap().revision, 1);
     }
 }
@@ -106,7 +106,7 @@ async fn a_mission_of_another_client_looks_like_a_missing_one() {
         assert_eq!(said(keeper.update(you.clone(), update(id), budget()).await.unwrap_err(), id), none);
     }
     keeper.delete(client("me"), "mine".into()).await.unwrap();
-    assert_eq!(keeper.count(), 0);
+    assert_eq!(keeper.missions.count(), 0);
 }
 
 #[test]

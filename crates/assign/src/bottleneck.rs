@@ -1,22 +1,12 @@
-//! The bottleneck assignment: minimise the largest cost instead of the sum (the time at which the last agent arrives,
-//! if all fly at the same speed).
+//! The bottleneck assignment: minimise the largest cost (when the last agent arrives, if all fly at the same speed).
 //!
 //! Binary search over the sorted costs with Hopcroft & Karp's maximum matching (1973) on the pairs up to the threshold;
 //! among the assignments with the smallest largest cost, the one with the smallest sum.
 
 use crate::greedy::ascending;
-use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_allowed, check_costs, cost_of};
+use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_allowed, cost_of};
 
 const NONE: u32 = u32::MAX;
-
-/// A bottleneck-optimal assignment.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Bottleneck {
-    /// The matching and its summed cost, the smallest among those with this `largest`.
-    pub assignment: Assignment,
-    /// The smallest possible largest cost; −∞ if no pair is allowed.
-    pub largest: f64,
-}
 
 /// The solver's memory. Reusing one allocates nothing but the answers.
 #[derive(Debug, Default)]
@@ -27,52 +17,22 @@ pub struct BottleneckSolver {
     values: Vec<f64>,
 }
 
-/// Solves the bottleneck problem for `cost`, row-major `[rows, cols]`.
-///
-/// # Errors
-/// As [`Solver::solve`].
-pub fn bottleneck(cost: &[f64], rows: usize, cols: usize) -> Result<Bottleneck, AssignError> {
-    check_costs(cost, rows, cols)?;
-    BottleneckSolver::default().search(cost, rows, cols, &|| true)
-}
-
 impl BottleneckSolver {
-    /// [`bottleneck`] where a cost of +∞ forbids a pair: as many pairs as possible, among those the smallest largest
-    /// cost, and among those the smallest sum. Stops as soon as `should_continue` returns false.
-    ///
-    /// # Errors
-    /// As [`Solver::solve_allowed`].
+    /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where +∞ forbids a pair; among those the smallest largest
+    /// cost, then the smallest sum. Stops as soon as `should_continue` returns false. Fails as [`Solver::solve_allowed`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],
         rows: usize,
         cols: usize,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Bottleneck, AssignError> {
+    ) -> Result<Assignment, AssignError> {
         check_allowed(cost, rows, cols)?;
-        self.search(cost, rows, cols, should_continue)
-    }
-
-    /// Gives back the memory of a problem of more than `cells` pairs.
-    pub fn forget_beyond(&mut self, cells: usize) {
-        if self.values.capacity() > cells {
-            *self = Self::default();
-        }
-    }
-
-    fn search(
-        &mut self,
-        cost: &[f64],
-        rows: usize,
-        cols: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Bottleneck, AssignError> {
         let Self { solver, matcher, values } = self;
         values.clear();
         values.extend(cost.iter().copied().filter(|&value| value < f64::INFINITY));
         if values.is_empty() {
-            let assignment = Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 };
-            return Ok(Bottleneck { assignment, largest: f64::NEG_INFINITY });
+            return Ok(Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 });
         }
         let none_forbidden = values.len() == cost.len();
         values.sort_unstable_by_key(|&value| ascending(value));
@@ -96,12 +56,12 @@ impl BottleneckSolver {
         let assignment = solver.solve_allowed(values, rows, cols, should_continue)?;
         // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
         if assignment.pairs().count() == pairs {
-            return Ok(Bottleneck { assignment, largest });
+            return Ok(assignment);
         }
         matcher.run(cost, rows, cols, largest, should_continue)?;
         let col_of_row = matcher.col_of_row.clone();
-        let sum = cost_of(cost, cols, &col_of_row);
-        Ok(Bottleneck { assignment: Assignment { col_of_row, cost: sum }, largest })
+        let cost = cost_of(cost, cols, &col_of_row);
+        Ok(Assignment { col_of_row, cost })
     }
 }
 

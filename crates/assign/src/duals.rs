@@ -10,7 +10,7 @@
 //! The bits of the answer do not depend on the machine: sums run in sixteen fixed lanes, multiply-adds are explicit,
 //! and the exponential and the logarithm are polynomials of this file.
 
-use crate::{AssignError, check_shape};
+use crate::{AssignError, check_size, invalid_entry};
 use wide::f32x16;
 
 const LANES: usize = 16;
@@ -21,36 +21,17 @@ const LARGEST_SCALE: f32 = 1e30;
 /// One relaxed correction is kept between this and its inverse, so that overshooting cannot feed itself.
 const LARGEST_STEP: f32 = 1e4;
 
-/// How ε falls. Lengths are in units of the mean cost.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Schedule {
-    /// ε of the first stage / mean cost.
-    pub first: f32,
-    /// ε of the last stage / mean cost.
-    pub last: f32,
-    /// Stages; ε falls by the same factor from one to the next.
-    pub stages: usize,
-    /// Most Sinkhorn rounds (rows, then columns) per stage.
-    pub rounds: usize,
-    /// A stage ends early when every column of the plan is within this share of its mass.
-    pub tolerance: f32,
-}
-
-impl Default for Schedule {
-    fn default() -> Self {
-        Self { first: 0.1, last: 0.0003, stages: 12, rounds: 128, tolerance: 0.05 }
-    }
-}
-
-impl Schedule {
-    /// For a problem of `pairs` pairs: problems too large to converge in a fraction of a second get fewer rounds.
-    pub fn for_pairs(pairs: usize) -> Self {
-        Self { rounds: (ROUND_PAIRS / pairs.max(1)).clamp(16, 128), ..Self::default() }
-    }
-}
-
+/// ε of the first and of the last stage, in units of the mean cost; it falls by the same factor from one to the next.
+const FIRST: f32 = 0.1;
+const LAST: f32 = 0.0003;
+const STAGES: usize = 12;
+/// Most Sinkhorn rounds (rows, then columns) per stage, and fewest for problems too large to converge in a fraction of a second.
+const MOST_ROUNDS: usize = 128;
+const FEWEST_ROUNDS: usize = 16;
 /// Pairs times rounds that a stage may take.
 const ROUND_PAIRS: usize = 64_000_000;
+/// A stage ends early when every column of the plan is within this share of its mass.
+const TOLERANCE: f32 = 0.05;
 
 /// The potentials of a problem.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,11 +51,12 @@ impl Duals {
 
 /// Sinkhorn potentials of `cost`, row-major `[rows, cols]`, in the units of the cost. Row sums are 1 and column sums
 /// rows / cols. A problem whose mean |cost| is 0 has potentials 0.
-///
-/// # Errors
-/// Empty or mismatched shapes, entries that are not finite or beyond 1e30, and a schedule out of range.
-pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize, schedule: &Schedule) -> Result<Duals, AssignError> {
-    check(cost, rows, cols, schedule)?;
+/// Fails for mismatched shapes, and entries that are not finite or beyond 1e30.
+pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize) -> Result<Duals, AssignError> {
+    check_size(cost.len(), rows, cols)?;
+    if let Some(place) = cost.iter().position(|value| value.is_nan() || value.abs() > 1e30) {
+        return Err(invalid_entry(place, cols, f64::from(cost[place])));
+    }
     let mean = cost.iter().map(|&c| f64::from(c.abs())).sum::<f64>() / cost.len() as f64;
     // Work in units of the mean: ε is then a plain number and nothing over- or underflows.
     if mean < f64::from(f32::MIN_POSITIVE) {
@@ -82,42 +64,14 @@ pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize, schedule: &Schedul
     }
     let unit = mean as f32;
     let mut sinkhorn = Sinkhorn::new(cost, rows, cols, unit);
-    let fall =
-        if schedule.stages > 1 { ln(schedule.last / schedule.first) / (schedule.stages - 1) as f32 } else { 0.0 };
-    for stage in 0..schedule.stages {
-        let left = (schedule.stages - 1 - stage) as f32;
-        sinkhorn.stage(schedule.last * exp(-fall * left), schedule.rounds, schedule.tolerance);
+    let rounds = (ROUND_PAIRS / cost.len()).clamp(FEWEST_ROUNDS, MOST_ROUNDS);
+    let fall = ln(LAST / FIRST) / (STAGES - 1) as f32;
+    for stage in 0..STAGES {
+        let left = (STAGES - 1 - stage) as f32;
+        sinkhorn.stage(LAST * exp(-fall * left), rounds);
     }
     let in_units = |prices: &[f32]| prices.iter().map(|price| price * unit).collect();
     Ok(Duals { rows: in_units(&sinkhorn.by_col.price[..rows]), cols: in_units(&sinkhorn.by_row.price[..cols]) })
-}
-
-fn check(cost: &[f32], rows: usize, cols: usize, schedule: &Schedule) -> Result<(), AssignError> {
-    check_shape(rows, cols)?;
-    let expected = rows.saturating_mul(cols);
-    if cost.len() != expected {
-        return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
-    }
-    if let Some(place) = cost.iter().position(|value| value.is_nan() || value.abs() > 1e30) {
-        return Err(AssignError::Entry { row: place / cols, col: place % cols, value: f64::from(cost[place]) });
-    }
-    let epsilons = [("schedule.first", schedule.first), ("schedule.last", schedule.last)];
-    for (field, value) in epsilons {
-        if !(1e-4..=100.0).contains(&value) {
-            let remedy = "use a share of the mean cost between 0.0001 and 100";
-            return Err(AssignError::Parameter { field, value: f64::from(value), remedy });
-        }
-    }
-    if !(0.0..=1.0).contains(&schedule.tolerance) {
-        let value = f64::from(schedule.tolerance);
-        return Err(AssignError::Parameter { field: "schedule.tolerance", value, remedy: "use a share from 0 to 1" });
-    }
-    for (field, value) in [("schedule.stages", schedule.stages), ("schedule.rounds", schedule.rounds)] {
-        if !(1..=100_000).contains(&value) {
-            return Err(AssignError::Parameter { field, value: value as f64, remedy: "use 1 to 100000" });
-        }
-    }
-    Ok(())
 }
 
 /// Costs and potentials in units of the mean cost. Kernel and costs are kept twice, once by rows and once by columns, so
@@ -170,8 +124,7 @@ impl Sinkhorn {
         Self { shape: (rows, cols), by_row, by_col, best }
     }
 
-    /// Scales the rows to sum 1, then the columns to rows / cols; how far the columns were from that. `correct` turns
-    /// (scale, wanted sum / present sum) into the new scale.
+    /// Scales the rows to sum 1, then the columns to rows / cols; returns how far they were from that.
     #[inline(always)]
     fn round(
         by_row: &mut Side,
@@ -185,9 +138,8 @@ impl Sinkhorn {
         rescale(&mut by_row.scale, &mut by_row.sum, cols, rows as f32 / cols as f32, correct)
     }
 
-    /// One ε: the kernel from the current potentials, rounds of scaling until the columns are within `tolerance` of their
-    /// mass or there were `rounds`, absorption.
-    fn stage(&mut self, epsilon: f32, rounds: usize, tolerance: f32) {
+    /// One ε: the kernel, rounds of scaling until the columns are within [`TOLERANCE`] of their mass, absorption.
+    fn stage(&mut self, epsilon: f32, rounds: usize) {
         let Self { shape, by_row, by_col, best } = self;
         let shape @ (rows, cols) = *shape;
         let rate = 1.0 / epsilon;
@@ -218,7 +170,7 @@ impl Sinkhorn {
             } else {
                 Self::round(by_row, by_col, shape, relaxed)
             };
-            if worst < tolerance {
+            if worst < TOLERANCE {
                 break;
             }
         }
@@ -347,8 +299,7 @@ fn exp(x: f32) -> f32 {
     p * f32::from_bits(exponent)
 }
 
-/// Natural logarithm of a positive normal number, absolute error below 4e-7 near 1: x = m · 2^n with m in
-/// [√½, √2), ln m = 2 artanh((m − 1) / (m + 1)).
+/// ln of a positive normal number, absolute error below 4e-7 near 1: x = m · 2^n, ln m = 2 artanh((m − 1) / (m + 1)).
 fn ln(x: f32) -> f32 {
     let bits = x.to_bits();
     // 0x3f3504f3 is √½; subtracting it makes the exponent field count from there.

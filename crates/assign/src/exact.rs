@@ -1,9 +1,8 @@
 //! The minimum-cost assignment, rectangular, in f64.
 //!
-//! Jonker & Volgenant 1987: column reduction, reduction transfer, one pass of augmenting row reduction (a second one
-//! costs more than it saves), then shortest augmenting paths (dense Dijkstra on reduced costs). With fewer rows than
-//! columns the column reduction is left out: a column that stays alone must keep the price 0, and only columns with a
-//! partner are ever repriced afterwards.
+//! Jonker & Volgenant 1987: column reduction, reduction transfer, one pass of augmenting row reduction (a second costs more
+//! than it saves), then shortest augmenting paths (dense Dijkstra). With fewer rows than columns the column reduction is left
+//! out: a column that stays alone must keep the price 0, and only columns with a partner are repriced later.
 //!
 //! Floating point: row prices are never stored (they follow from the matched entry), a repricing that rounds to nothing
 //! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
@@ -11,8 +10,7 @@
 
 mod shortlist;
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, compensated_sum, distances_into};
-
+use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cost_of, distances_into};
 use shortlist::{Shortlists, WORTH_IT};
 
 const NONE: u32 = u32::MAX;
@@ -39,7 +37,6 @@ pub struct Solver {
     col_of_row: Vec<u32>,
     free: Vec<u32>,
     still_free: Vec<u32>,
-    points: Vec<f64>,
     shortlists: Shortlists,
     /// Columns from which on there are shortlists, if not the usual number.
     pub(crate) lists_from: Option<usize>,
@@ -59,23 +56,18 @@ struct Branch {
     length: f64,
 }
 
-/// Solves one problem; see [`Solver::solve`]. A caller with many problems keeps a [`Solver`].
-pub fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
-    Solver::default().solve(cost, rows, cols)
-}
-
 /// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
 /// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
 pub fn exact_points(agents: &[f32], goals: &[f32], dims: usize) -> Result<(Vec<u32>, f64), AssignError> {
-    let answer = Solver::default().solve_points(agents, goals, dims)?;
+    let mut cost = Vec::new();
+    let (rows, cols) = distances_into(agents, goals, dims, &mut cost)?;
+    let answer = Solver::default().solve(&cost, rows, cols)?;
     Ok((answer.col_of_row, answer.cost))
 }
 
 impl Solver {
     /// The assignment of min(rows, cols) pairs with the smallest summed cost; `cost` is row-major `[rows, cols]`.
-    ///
-    /// # Errors
-    /// Empty or mismatched shapes, and the first entry that is NaN, infinite or beyond 1e300.
+    /// Fails for mismatched shapes, and at the first entry that is NaN, infinite or beyond 1e300.
     pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
         check_costs(cost, rows, cols)?;
         self.solve_checked(cost, rows, cols, None, &|| true)
@@ -83,9 +75,6 @@ impl Solver {
 
     /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
     /// Stops as soon as `should_continue` returns false; it is called once per shortest-path search.
-    ///
-    /// # Errors
-    /// As [`Solver::solve`], and [`AssignError::Interrupted`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],
@@ -131,20 +120,8 @@ impl Solver {
                 }
             }
         }
-        let cost = compensated_sum(crate::pairs(&col_of_row).map(|(row, col)| cost[row * cols + col]));
+        let cost = cost_of(cost, cols, &col_of_row);
         Ok(Assignment { col_of_row, cost })
-    }
-
-    /// [`exact_points`] with this solver's memory.
-    ///
-    /// # Errors
-    /// Empty or ragged arrays and coordinates that are not finite.
-    pub fn solve_points(&mut self, agents: &[f32], goals: &[f32], dims: usize) -> Result<Assignment, AssignError> {
-        let mut points = std::mem::take(&mut self.points);
-        let answer =
-            distances_into(agents, goals, dims, &mut points).and_then(|(rows, cols)| self.solve(&points, rows, cols));
-        self.points = points;
-        answer
     }
 
     fn run(
@@ -179,14 +156,6 @@ impl Solver {
             self.augment(cost, cols, self.free[next]);
         }
         Ok(())
-    }
-
-    /// Frees the buffers of a problem of more than `cells` pairs.
-    pub fn forget_beyond(&mut self, cells: usize) {
-        let large = self.price.len() * self.col_of_row.len() > cells;
-        if large || self.cost.capacity() > cells {
-            *self = Self::default();
-        }
     }
 
     /// Column reduction: each column takes the price of its cheapest row, and the row itself if it is still free. Then the
@@ -263,8 +232,7 @@ impl Solver {
         cols >= self.lists_from.unwrap_or(WORTH_IT)
     }
 
-    /// Finds the shortest alternating path from a free row to a free column, reprices the columns of the tree and
-    /// flips the path.
+    /// Finds the shortest alternating path from a free row to a free column, reprices the tree and flips the path.
     fn augment(&mut self, cost: &[f64], cols: usize, start: u32) {
         let listed = self.listed(cols);
         let Self { stride, price, open_price, distance, tree, row_of_col, col_of_row, shortlists, unread, .. } = self;

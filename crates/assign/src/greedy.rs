@@ -1,36 +1,19 @@
 //! Greedy assignment: the globally cheapest pair first.
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cost_of};
+use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, cost_of};
 
 /// Pairs that are sorted at once.
 const CHUNK: usize = 1 << 16;
 
-/// Takes the cheapest remaining pair until one side is used up; ties go to the lowest (row, column). `cost` is
-/// row-major `[rows, cols]`.
-///
-/// # Errors
-/// As [`crate::Solver::solve`].
-pub fn greedy(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
-    check_costs(cost, rows, cols)?;
-    take(cost, rows, cols, &|| true)
-}
-
-/// The same where a cost of +∞ forbids a pair. It may end with fewer pairs than are possible. Stops as soon as `should_continue`
-/// returns false.
-///
-/// # Errors
-/// As [`crate::Solver::solve_allowed`].
-pub fn greedy_allowed(
+/// Takes the cheapest remaining pair of `cost` `[rows, cols]` until one side is used up; ties go to the lowest (row, column),
+/// and +∞ forbids a pair. Stops as soon as `should_continue` returns false. Fails as [`crate::Solver::solve_allowed`].
+pub fn greedy(
     cost: &[f64],
     rows: usize,
     cols: usize,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     check_allowed(cost, rows, cols)?;
-    take(cost, rows, cols, should_continue)
-}
-
-fn take(cost: &[f64], rows: usize, cols: usize, should_continue: &dyn Fn() -> bool) -> Result<Assignment, AssignError> {
     let allowed = cost.iter().enumerate().filter(|&(_, &value)| value < f64::INFINITY);
     let mut order: Vec<(u64, u64)> = allowed.map(|(place, &value)| (ascending(value), place as u64)).collect();
     let mut col_of_row = vec![UNASSIGNED; rows];

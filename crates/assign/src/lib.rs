@@ -1,8 +1,8 @@
 //! Assignment of agents to goals by distance.
 //!
-//! [`exact()`] is the optimum (the Hungarian baseline C_h of the paper's eq. 4), [`bottleneck()`] minimises the longest
-//! distance instead of the sum, [`greedy()`] and [`random`] are the baselines a learned commander is
-//! compared with, and [`duals`] are entropic transport prices, a feature for such a commander.
+//! [`exact`] is the optimum (the Hungarian baseline C_h of the paper's eq. 4), [`bottleneck`] minimises the longest distance
+//! instead of the sum, [`greedy()`] and [`random`] are the baselines a learned commander is compared with, and [`duals`] are
+//! entropic transport prices, a feature for such a commander.
 //!
 //! Costs are row-major `[rows, cols]`: rows are agents, columns are goals. Either side may be the longer one; it then
 //! keeps members without a partner, marked [`UNASSIGNED`].
@@ -12,6 +12,7 @@
     reason = "kernels index several arrays by one counter; iterators hide which elements meet"
 )]
 
+use magex_core::error::FieldError;
 use thiserror::Error;
 
 pub mod bottleneck;
@@ -20,9 +21,9 @@ pub mod exact;
 pub mod greedy;
 pub mod random;
 
-pub use bottleneck::{BottleneckSolver, bottleneck};
-pub use exact::{Solver, exact, exact_points};
-pub use greedy::{greedy, greedy_allowed};
+pub use bottleneck::BottleneckSolver;
+pub use exact::{Solver, exact_points};
+pub use greedy::greedy;
 
 /// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).
 pub const UNASSIGNED: u32 = u32::MAX;
@@ -30,70 +31,22 @@ pub const UNASSIGNED: u32 = u32::MAX;
 /// Largest magnitude of a cost. Sums along a path of any length stay finite below it.
 pub const LARGEST_COST: f64 = 1e300;
 
-/// Why an assignment problem is rejected.
-#[derive(Debug, Clone, PartialEq, Error)]
+/// Why an assignment problem has no answer.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum AssignError {
-    /// No rows or no columns.
-    #[error("cost: {rows} rows by {cols} columns is empty; both must be at least 1")]
-    Empty {
-        /// Rows asked for.
-        rows: usize,
-        /// Columns asked for.
-        cols: usize,
-    },
-    /// More rows or columns than an index can name.
-    #[error("cost: {rows} rows by {cols} columns is too large; both must be below 2^31")]
-    TooLarge {
-        /// Rows asked for.
-        rows: usize,
-        /// Columns asked for.
-        cols: usize,
-    },
-    /// An array does not have the length of its shape.
-    #[error("{field}: {found} numbers, the shape asks for {expected}")]
-    Size {
-        /// Which array.
-        field: &'static str,
-        /// Its length.
-        found: usize,
-        /// The length of its shape.
-        expected: usize,
-    },
-    /// NaN, infinite or beyond [`LARGEST_COST`].
-    #[error("cost[{row}][{col}]: {value} is not a finite number up to 1e300")]
-    Entry {
-        /// Row of the entry.
-        row: usize,
-        /// Column of the entry.
-        col: usize,
-        /// The entry.
-        value: f64,
-    },
-    /// A coordinate is NaN or infinite.
-    #[error("{field}[{point}][{axis}]: {value} is not finite")]
-    Coordinate {
-        /// `agents` or `goals`.
-        field: &'static str,
-        /// Index of the point.
-        point: usize,
-        /// Index of the coordinate.
-        axis: usize,
-        /// The coordinate.
-        value: f32,
-    },
+    /// A size or a number is invalid.
+    #[error(transparent)]
+    Invalid(#[from] FieldError),
     /// The caller cancelled.
     #[error("interrupted before an answer was found")]
     Interrupted,
-    /// A parameter is out of range.
-    #[error("{field}: {value} is out of range; {remedy}")]
-    Parameter {
-        /// Which parameter.
-        field: &'static str,
-        /// Its value.
-        value: f64,
-        /// The remedy.
-        remedy: &'static str,
-    },
+}
+
+impl AssignError {
+    /// A problem with a field.
+    pub fn invalid(field: impl Into<String>, problem: impl Into<String>) -> Self {
+        Self::Invalid(FieldError::new(field, problem))
+    }
 }
 
 /// A matching of min(rows, cols) pairs.
@@ -106,11 +59,6 @@ pub struct Assignment {
 }
 
 impl Assignment {
-    /// The column of a row, if it has one.
-    pub fn col(&self, row: usize) -> Option<u32> {
-        self.col_of_row.get(row).copied().filter(|&col| col != UNASSIGNED)
-    }
-
     /// (row, column) of every pair, rows ascending.
     pub fn pairs(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         pairs(&self.col_of_row)
@@ -118,7 +66,7 @@ impl Assignment {
 }
 
 /// (row, column) of every pair of a column list, rows ascending.
-pub(crate) fn pairs(col_of_row: &[u32]) -> impl Iterator<Item = (usize, usize)> + '_ {
+pub fn pairs(col_of_row: &[u32]) -> impl Iterator<Item = (usize, usize)> + '_ {
     col_of_row.iter().enumerate().filter(|&(_, &col)| col != UNASSIGNED).map(|(row, &col)| (row, col as usize))
 }
 
@@ -156,20 +104,14 @@ pub(crate) fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Checks shape and entries of a cost matrix `[rows, cols]`.
-pub fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<(), AssignError> {
-    check_shape(rows, cols)?;
-    // A product that overflows cannot be the length of anything, so saturating is enough to refuse it.
-    let expected = rows.saturating_mul(cols);
-    if cost.len() != expected {
-        return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
-    }
+fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<(), AssignError> {
+    check_size(cost.len(), rows, cols)?;
     // Counting instead of searching vectorises.
-    let bad = cost.iter().filter(|&&value| !usable(value)).count();
-    if bad == 0 {
+    if cost.iter().filter(|&&value| !usable(value)).count() == 0 {
         return Ok(());
     }
     let place = cost.iter().position(|&value| !usable(value)).unwrap_or_default();
-    Err(AssignError::Entry { row: place / cols, col: place % cols, value: cost[place] })
+    Err(invalid_entry(place, cols, cost[place]))
 }
 
 /// What [`check_allowed`] learns about a matrix in which +∞ forbids a pair.
@@ -184,8 +126,7 @@ pub(crate) struct Span {
 }
 
 impl Span {
-    /// A price for forbidden pairs, so high that one of them costs more than any `pairs` others could save. Low enough
-    /// that the others keep their digits.
+    /// A price of forbidden pairs, above all that others could save, and so low that the others keep their digits.
     pub(crate) fn penalty(&self, pairs: usize) -> f64 {
         if self.least > self.largest {
             return 1.0;
@@ -198,11 +139,7 @@ impl Span {
 
 /// Checks shape and entries of a cost matrix `[rows, cols]` in which +∞ forbids a pair.
 pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Span, AssignError> {
-    check_shape(rows, cols)?;
-    let expected = rows.saturating_mul(cols);
-    if cost.len() != expected {
-        return Err(AssignError::Size { field: "cost", found: cost.len(), expected });
-    }
+    check_size(cost.len(), rows, cols)?;
     let mut span = Span { forbidden: 0, least: f64::INFINITY, largest: f64::NEG_INFINITY };
     for (block, values) in cost.chunks(BLOCK).enumerate() {
         let lower = |a: f64, b: f64| if b < a { b } else { a };
@@ -228,8 +165,7 @@ pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Sp
             } else if value == f64::INFINITY {
                 span.forbidden += 1;
             } else {
-                let place = block * BLOCK + place;
-                return Err(AssignError::Entry { row: place / cols, col: place % cols, value });
+                return Err(invalid_entry(block * BLOCK + place, cols, value));
             }
         }
     }
@@ -244,27 +180,34 @@ fn usable(cost: f64) -> bool {
     cost.abs() <= LARGEST_COST
 }
 
-pub(crate) fn check_shape(rows: usize, cols: usize) -> Result<(), AssignError> {
-    if rows == 0 || cols == 0 {
-        return Err(AssignError::Empty { rows, cols });
-    }
-    if rows.max(cols) >= 1 << 31 {
-        return Err(AssignError::TooLarge { rows, cols });
-    }
-    Ok(())
+fn invalid_entry(place: usize, cols: usize, value: f64) -> AssignError {
+    let (row, col) = (place / cols, place % cols);
+    AssignError::invalid(format!("cost[{row}][{col}]"), format!("{value} is not a finite number up to 1e300"))
 }
 
-/// Distances `[rows, cols]` in f64 between f32 points: agents `[rows, dims]`, goals `[cols, dims]`.
-pub fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>, AssignError> {
-    let mut cost = Vec::new();
-    distances_into(agents, goals, dims, &mut cost)?;
-    Ok(cost)
+fn check_shape(rows: usize, cols: usize) -> Result<(), AssignError> {
+    let problem = match (rows.min(cols), rows.max(cols)) {
+        (0, _) => "is empty; both must be at least 1",
+        (_, 0x8000_0000..) => "is too large; both must be below 2^31",
+        _ => return Ok(()),
+    };
+    Err(AssignError::invalid("cost", format!("{rows} rows by {cols} columns {problem}")))
 }
 
-/// [`distances`] into a buffer that is reused; returns (rows, cols).
-///
-/// # Errors
-/// As [`distances`].
+/// Checks a shape and the number of its entries.
+fn check_size(found: usize, rows: usize, cols: usize) -> Result<(), AssignError> {
+    check_shape(rows, cols)?;
+    // A product that overflows cannot be the length of anything, so saturating is enough to refuse it.
+    let expected = rows.saturating_mul(cols);
+    if found == expected { Ok(()) } else { Err(invalid_size("cost", found, expected)) }
+}
+
+fn invalid_size(field: &str, found: usize, expected: usize) -> AssignError {
+    AssignError::invalid(field, format!("{found} numbers, the shape asks for {expected}"))
+}
+
+/// Distances `[rows, cols]` in f64 between agents `[rows, dims]` and goals `[cols, dims]`; returns (rows, cols).
+/// Fails for empty or ragged arrays and coordinates that are not finite.
 pub fn distances_into(
     agents: &[f32],
     goals: &[f32],
@@ -272,16 +215,15 @@ pub fn distances_into(
     cost: &mut Vec<f64>,
 ) -> Result<(usize, usize), AssignError> {
     if dims == 0 {
-        return Err(AssignError::Parameter { field: "dims", value: 0.0, remedy: "use at least 1" });
+        return Err(AssignError::invalid("dims", "0 is out of range; use at least 1"));
     }
     for (field, points) in [("agents", agents), ("goals", goals)] {
         if !points.len().is_multiple_of(dims) {
-            let expected = points.len().div_ceil(dims) * dims;
-            return Err(AssignError::Size { field, found: points.len(), expected });
+            return Err(invalid_size(field, points.len(), points.len().div_ceil(dims) * dims));
         }
         if let Some(place) = points.iter().position(|x| !x.is_finite()) {
-            let (point, axis) = (place / dims, place % dims);
-            return Err(AssignError::Coordinate { field, point, axis, value: points[place] });
+            let path = format!("{field}[{}][{}]", place / dims, place % dims);
+            return Err(AssignError::invalid(path, format!("{} is not finite", points[place])));
         }
     }
     let (rows, cols) = (agents.len() / dims, goals.len() / dims);

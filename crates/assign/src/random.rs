@@ -4,10 +4,7 @@ use crate::bottleneck::Matcher;
 use crate::{AssignError, UNASSIGNED, check_allowed, check_shape};
 use magex_core::rng::Stream;
 
-/// A uniformly random matching of min(rows, cols) pairs: the column of each row, or [`UNASSIGNED`].
-///
-/// # Errors
-/// No rows or no columns.
+/// A uniformly random matching of min(rows, cols) pairs: the column of each row. Fails without rows or columns.
 pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>, AssignError> {
     check_shape(rows, cols)?;
     let mut col_of_row = stream.permutation(rows.max(cols));
@@ -22,10 +19,7 @@ pub fn random(rows: usize, cols: usize, stream: &mut Stream) -> Result<Vec<u32>,
 }
 
 /// A random matching of as many pairs as possible where a cost of +∞ forbids a pair; uniform only if none is forbidden.
-/// Stops as soon as `should_continue` returns false.
-///
-/// # Errors
-/// As [`crate::Solver::solve_allowed`].
+/// Stops as soon as `should_continue` returns false. Fails as [`crate::Solver::solve_allowed`].
 pub fn random_allowed(
     cost: &[f64],
     rows: usize,

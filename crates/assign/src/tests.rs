@@ -1,4 +1,4 @@
-use crate::duals::{Schedule, sinkhorn_duals};
+use crate::duals::sinkhorn_duals;
 use crate::*;
 use magex_core::rng::{Key, Purpose, Stream};
 use pathfinding::kuhn_munkres::kuhn_munkres_min;
@@ -14,6 +14,21 @@ fn uniform_points(n: usize, index: u32) -> (Vec<f32>, Vec<f32>) {
     let mut stream = Key::new(0, Purpose::Bench, &[n as u32, index]).stream();
     let mut points = || (0..2 * n).map(|_| stream.uniform32()).collect();
     (points(), points())
+}
+
+fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>, AssignError> {
+    let mut cost = Vec::new();
+    distances_into(agents, goals, dims, &mut cost)?;
+    Ok(cost)
+}
+
+fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+    Solver::default().solve(cost, rows, cols)
+}
+
+/// The largest cost of a pair; −∞ without pairs.
+fn largest_of((_, cols, cost): &Problem, answer: &Assignment) -> f64 {
+    answer.pairs().map(|(row, col)| cost[row * cols + col]).fold(f64::NEG_INFINITY, f64::max)
 }
 
 /// Shape, entries.
@@ -92,7 +107,7 @@ fn a_solver_that_is_told_to_stop_stops_and_can_be_used_again() {
     let stopped = BottleneckSolver::default().solve_allowed(&cost, 60, 60, &|| false);
     assert_eq!(stopped, Err(AssignError::Interrupted));
     let large = vec![1.0; 300 * 300];
-    assert_eq!(greedy_allowed(&large, 300, 300, &|| false), Err(AssignError::Interrupted));
+    assert_eq!(greedy(&large, 300, 300, &|| false), Err(AssignError::Interrupted));
     let mut banned = cost.clone();
     banned[7] = f64::INFINITY;
     let stopped = random::random_allowed(&banned, 60, 60, &mut stream(1), &|| false);
@@ -118,7 +133,7 @@ fn greedy_takes_the_cheapest_pair_also_where_it_sorts_in_pieces() {
             (expected[row], taken[col]) = (col as u32, true);
         }
     }
-    assert_eq!(greedy(&cost, rows, cols).unwrap().col_of_row, expected);
+    assert_eq!(greedy(&cost, rows, cols, &|| true).unwrap().col_of_row, expected);
 }
 
 fn small_problem() -> impl Strategy<Value = Problem> {
@@ -168,10 +183,10 @@ proptest! {
         prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
         prop_assert!(close(answer.cost, sum, &finite), "{} instead of {sum}", answer.cost);
         let answer = BottleneckSolver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
-        prop_assert!(allowed(&answer.assignment) && answer.assignment.pairs().count() == pairs);
-        prop_assert_eq!(answer.largest, largest);
-        prop_assert!(close(answer.assignment.cost, within, &finite), "{} not {within}", answer.assignment.cost);
-        let answer = greedy_allowed(cost, rows, cols, &|| true).unwrap();
+        prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
+        prop_assert_eq!(largest_of(&problem, &answer), largest);
+        prop_assert!(close(answer.cost, within, &finite), "{} not {within}", answer.cost);
+        let answer = greedy(cost, rows, cols, &|| true).unwrap();
         prop_assert!(allowed(&answer) && 2 * answer.pairs().count() >= pairs);
         let col_of_row = random::random_allowed(cost, rows, cols, &mut chance, &|| true).unwrap();
         let answer = Assignment { cost: 0.0, col_of_row };
@@ -185,10 +200,10 @@ proptest! {
         let answer = exact(cost, *rows, *cols).unwrap();
         check_matching(&problem, &answer);
         prop_assert!(close(answer.cost, sum, cost), "{} instead of {sum}", answer.cost);
-        let answer = bottleneck(cost, *rows, *cols).unwrap();
-        check_matching(&problem, &answer.assignment);
-        prop_assert_eq!(answer.largest, largest);
-        prop_assert!(close(answer.assignment.cost, within, cost), "{} instead of {within}", answer.assignment.cost);
+        let answer = BottleneckSolver::default().solve_allowed(cost, *rows, *cols, &|| true).unwrap();
+        check_matching(&problem, &answer);
+        prop_assert_eq!(largest_of(&problem, &answer), largest);
+        prop_assert!(close(answer.cost, within, cost), "{} instead of {within}", answer.cost);
     }
 
     #[test]
@@ -208,7 +223,7 @@ proptest! {
         let (rows, cols, cost) = &problem;
         let optimum = exact(cost, *rows, *cols).unwrap().cost;
         let scale = 1e-12 * cost.iter().fold(0.0f64, |scale, c| scale.max(c.abs()));
-        let answer = greedy(cost, *rows, *cols).unwrap();
+        let answer = greedy(cost, *rows, *cols, &|| true).unwrap();
         check_matching(&problem, &answer);
         prop_assert!(answer.cost >= optimum - scale);
         let col_of_row = random::random(*rows, *cols, &mut stream(seed)).unwrap();
@@ -373,7 +388,7 @@ fn duals_lead_close_to_the_optimum() {
             let (agents, goals) = uniform_points(n, index);
             let cost = distances(&agents, &goals, 2).unwrap();
             let narrow: Vec<f32> = cost.iter().map(|&c| c as f32).collect();
-            let duals = sinkhorn_duals(&narrow, n, n, &Schedule::for_pairs(n * n)).unwrap();
+            let duals = sinkhorn_duals(&narrow, n, n).unwrap();
             total += cost_of(&cost, n, &by_regret(&narrow, n, &duals)) / exact(&cost, n, n).unwrap().cost;
         }
         let ratio = total / f64::from(instances);
@@ -383,14 +398,13 @@ fn duals_lead_close_to_the_optimum() {
 
 #[test]
 fn duals_of_awkward_costs_are_finite_and_follow_the_unit() {
-    let schedule = Schedule::default();
     let mut stream = stream(9);
     let wild: Vec<f32> = (0..20 * 30).map(|_| 10f32.powi(stream.below(24) as i32 - 12)).collect();
     let two_levels: Vec<f32> = (0..20 * 30).map(|k| if k % 7 == 0 { 0.0 } else { 1e9 }).collect();
     let flat = vec![3.0; 600];
     for (name, cost) in [("wild", &wild), ("levels", &two_levels), ("flat", &flat), ("zero", &vec![0.0; 600])] {
         for (rows, cols) in [(20, 30), (30, 20), (1, 600), (600, 1)] {
-            let duals = sinkhorn_duals(cost, rows, cols, &schedule).unwrap();
+            let duals = sinkhorn_duals(cost, rows, cols).unwrap();
             assert_eq!((duals.rows.len(), duals.cols.len()), (rows, cols));
             let finite = duals.rows.iter().chain(&duals.cols).all(|x| x.is_finite());
             assert!(finite, "{name} {rows} x {cols}: {duals:?}");
@@ -398,8 +412,7 @@ fn duals_of_awkward_costs_are_finite_and_follow_the_unit() {
     }
     let uniform: Vec<f32> = (0..400).map(|_| stream.uniform32()).collect();
     let doubled: Vec<f32> = uniform.iter().map(|c| c * 1024.0).collect();
-    let (one, other) =
-        (sinkhorn_duals(&uniform, 20, 20, &schedule).unwrap(), sinkhorn_duals(&doubled, 20, 20, &schedule).unwrap());
+    let (one, other) = (sinkhorn_duals(&uniform, 20, 20).unwrap(), sinkhorn_duals(&doubled, 20, 20).unwrap());
     assert!(one.cols.iter().zip(&other.cols).all(|(a, b)| a * 1024.0 == *b));
 }
 
@@ -407,18 +420,14 @@ fn duals_of_awkward_costs_are_finite_and_follow_the_unit() {
 fn the_bits_of_the_duals_are_pinned() {
     let (agents, goals) = uniform_points(37, 0);
     let cost: Vec<f32> = distances(&agents, &goals, 2).unwrap().iter().map(|&c| c as f32).collect();
-    let duals = sinkhorn_duals(&cost, 37, 37, &Schedule::default()).unwrap();
+    let duals = sinkhorn_duals(&cost, 37, 37).unwrap();
     let mix = |hash: u32, value: &f32| hash.rotate_left(5).wrapping_mul(0x9e37_79b9) ^ value.to_bits();
     assert_eq!(duals.rows.iter().chain(&duals.cols).fold(0, mix), 197_731_012);
 }
 
 #[test]
 fn duals_refuse_bad_input_by_name() {
-    let refuse = |cost: &[f32], schedule: &Schedule| sinkhorn_duals(cost, 1, 2, schedule).unwrap_err().to_string();
-    let good = Schedule::default();
-    assert!(refuse(&[1.0, f32::NAN], &good).starts_with("cost[0][1]: NaN"));
-    assert!(refuse(&[1.0], &good).contains("1 numbers"));
-    assert!(refuse(&[1.0, 2.0], &Schedule { last: 0.0, ..good }).contains("schedule.last"));
-    assert!(refuse(&[1.0, 2.0], &Schedule { rounds: 0, ..good }).contains("schedule.rounds"));
-    assert!(refuse(&[1.0, 2.0], &Schedule { tolerance: f32::NAN, ..good }).contains("schedule.tolerance"));
+    let refuse = |cost: &[f32]| sinkhorn_duals(cost, 1, 2).unwrap_err().to_string();
+    assert!(refuse(&[1.0, f32::NAN]).starts_with("cost[0][1]: NaN"));
+    assert!(refuse(&[1.0]).contains("1 numbers"));
 }

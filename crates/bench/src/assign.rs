@@ -5,14 +5,13 @@ mod load;
 use crate::goals::learned_ratio;
 use crate::report::Report;
 use crate::runs::Keep;
-use crate::solver::{time_exact, uniform_points};
+use crate::solver::{distances, time_exact, uniform_points};
 use crate::vitals::memory_mib;
 use load::{Flood, flood, one_client, saturate};
 use magex::folder;
 use magex::output::{note, thousands};
 use magex::settings;
 use magex::supervise::service::Service;
-use magex_assign::distances;
 use magex_core::config::{CommanderConfig, CommanderPolicy, RunConfig};
 use magex_nets::commander::Commander;
 use magex_nets::params::to_safetensors;
@@ -119,7 +118,7 @@ print(sorted(times)[len(times) // 2] * 1e6)
     let mut bytes = Vec::with_capacity(instances as usize * n * n * 8);
     for index in 0..instances {
         let (agents, goals) = uniform_points(n, index);
-        let cost = distances(&agents, &goals, 2).map_err(|error| error.to_string())?;
+        let cost = distances(&agents, &goals).map_err(|error| error.to_string())?;
         bytes.extend(cost.iter().flat_map(|value| value.to_le_bytes()));
     }
     let mut child = Command::new(python)

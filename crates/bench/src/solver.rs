@@ -1,7 +1,7 @@
 //! Timings of the exact solver on uniform instances.
 
 use crate::stats::quantile;
-use magex_assign::{AssignError, Solver, distances};
+use magex_assign::{AssignError, Solver, distances_into};
 use magex_core::rng::{Key, Purpose};
 use std::hint::black_box;
 use std::time::Instant;
@@ -15,6 +15,13 @@ pub(crate) fn uniform_points(n: usize, index: u32) -> (Vec<f32>, Vec<f32>) {
     (agents, goals)
 }
 
+/// Distances `[n, n]` between agents and goals `[n, 2]`.
+pub(crate) fn distances(agents: &[f32], goals: &[f32]) -> Result<Vec<f64>, AssignError> {
+    let mut cost = Vec::new();
+    distances_into(agents, goals, 2, &mut cost)?;
+    Ok(cost)
+}
+
 /// Median microseconds of an exact solve of an n × n Euclidean cost matrix over `instances` instances.
 ///
 /// # Errors
@@ -24,7 +31,7 @@ pub(crate) fn time_exact(n: usize, instances: u32) -> Result<f64, AssignError> {
     let mut times = Vec::with_capacity(instances as usize);
     for index in 0..instances {
         let (agents, goals) = uniform_points(n, index);
-        let cost = distances(&agents, &goals, 2)?;
+        let cost = distances(&agents, &goals)?;
         if index == 0 {
             solver.solve(&cost, n, n)?; // The first call allocates.
         }

@@ -21,6 +21,18 @@ impl FieldError {
         Self::new(field, "missing")
     }
 
+    /// `Ok` if the condition holds; otherwise the field and the problem that are given.
+    ///
+    /// # Errors
+    /// The condition does not hold.
+    pub fn ensure<F: Into<String>, P: Into<String>>(ok: bool, otherwise: impl FnOnce() -> (F, P)) -> Result<(), Self> {
+        if ok {
+            return Ok(());
+        }
+        let (field, problem) = otherwise();
+        Err(Self::new(field, problem))
+    }
+
     /// The same problem, named from the section or message that encloses the field.
     #[must_use]
     pub fn within(self, outer: &str) -> Self {

@@ -35,12 +35,13 @@ impl fmt::Display for RunId {
 }
 
 /// How actions and goals are chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
     /// Sampled from the policy; the graph's Gumbel noise is on (training, "sampled" evaluation).
     Sampled,
     /// The most likely action, goal and edges.
+    #[default]
     Greedy,
 }
 

@@ -5,7 +5,27 @@ use crate::engine::Plan;
 use crate::problem::Problem;
 use magex_proto::v1;
 
-/// Writes the response. The caller adds the weights, the reason of a fallback and the time.
+/// A plan and its origin.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Planned {
+    /// The plan.
+    pub plan: Plan,
+    /// Why another method than the requested one answered; empty otherwise.
+    pub fallback_reason: String,
+    /// Weights that answered: version, SHA-256, run.
+    pub weights: Option<(u32, String, String)>,
+}
+
+impl Planned {
+    /// Writes the response. The caller adds the time.
+    pub fn respond(self, problem: &Problem) -> v1::AssignResponse {
+        let fallback_reason = self.fallback_reason;
+        let (version, sha256, run_id) = self.weights.unwrap_or_default();
+        v1::AssignResponse { fallback_reason, version, sha256, run_id, ..write(problem, &self.plan) }
+    }
+}
+
+/// Writes the response without the weights and the reason of a fallback.
 pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     let (n, g) = (problem.agent_count, problem.goal_count);
     let mut response = v1::AssignResponse {
@@ -42,16 +62,16 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
     }
     response.largest_cost = largest.unwrap_or(0.0);
     response.unassigned_goals.extend((0..g as u32).filter(|&goal| free[goal as usize]));
-    response.agents_without_goal =
-        reasons(&response.unassigned_agents, &problem.agent_ids, &plan.isolated.agents, n > g);
-    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, &plan.isolated.goals, g > n);
+    let [agents, goals] = &plan.isolated;
+    response.agents_without_goal = reasons(&response.unassigned_agents, &problem.agent_ids, agents, n > g);
+    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, goals, g > n);
     let left = |(now, then): (&u32, &u32)| *then != UNASSIGNED && now != then;
     response.switches = plan.goal_of.iter().zip(&problem.current).filter(|pair| left(*pair)).count() as u32;
     response
 }
 
 /// cost / exact − 1; `None` where it is undefined.
-pub(crate) fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
+fn gap(cost: f64, exact: Option<f64>) -> Option<f64> {
     let exact = exact?;
     if exact > 0.0 {
         // The sums are rounded in different orders.

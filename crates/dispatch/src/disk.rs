@@ -59,6 +59,9 @@ fn other_format(format: &u64) -> String {
     }
 }
 
+/// All acknowledged missions, by name.
+pub(crate) type Kept = BTreeMap<String, Arc<Mission>>;
+
 /// Opens or creates the database.
 type Opener = Box<dyn Fn() -> Result<Database, redb::Error> + Send + Sync>;
 
@@ -79,10 +82,7 @@ impl fmt::Debug for Disk {
 }
 
 impl Disk {
-    /// Opens or creates the file.
-    ///
-    /// # Errors
-    /// The file cannot be opened, is in use, or has another format.
+    /// Opens or creates the file. Fails if it cannot be opened, is in use, or has another format.
     pub fn open(path: &Path) -> Result<Self, DiskError> {
         let path: PathBuf = path.to_owned();
         let opener = move || Ok(Database::builder().set_cache_size(CACHE).create(&path)?);
@@ -90,19 +90,13 @@ impl Disk {
     }
 
     /// The same with any database, which is reopened at the earliest `pause` after a failed write.
-    ///
-    /// # Errors
-    /// As [`Disk::open`].
     pub fn opened_by(opener: Opener, pause: Duration) -> Result<Self, DiskError> {
         let database = opener()?;
         prepare(&database)?;
         Ok(Self { opener, database: Some(database), failed: None, pause })
     }
 
-    /// All missions, by name.
-    ///
-    /// # Errors
-    /// The file cannot be read, or a record is damaged.
+    /// All missions, by name. Fails if a record is damaged.
     pub fn load(&self) -> Result<Vec<Mission>, DiskError> {
         let read = self.database.as_ref().ok_or(DiskError::Paused)?.begin_read()?;
         let table = read.open_table(MISSIONS)?;
@@ -116,44 +110,30 @@ impl Disk {
     }
 
     /// Writes and removes missions in one durable transaction. `kept` are all acknowledged missions.
-    ///
-    /// # Errors
-    /// The write failed. Then nothing has changed for clients, and the file is reopened before the next change.
-    pub fn change(
-        &mut self,
-        put: &[&Mission],
-        remove: &[&str],
-        kept: &BTreeMap<String, Arc<Mission>>,
-    ) -> Result<(), DiskError> {
-        if self.database.is_none() && self.failed.is_some_and(|since| since.elapsed() < self.pause) {
-            return Err(DiskError::Paused);
+    /// After a failed write nothing has changed for clients, and the file is reopened before the next change.
+    pub fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), DiskError> {
+        // A failed write drops the database, which closes the file, so that it can be reopened.
+        let database = match self.database.take() {
+            Some(database) => Ok(database),
+            None if self.failed.is_some_and(|since| since.elapsed() < self.pause) => return Err(DiskError::Paused),
+            None => self.reopen(kept),
+        };
+        let written = database.and_then(|database| write(&database, put, remove).map(|()| database));
+        match written {
+            Ok(database) => self.database = Some(database),
+            Err(error) => {
+                self.failed = Some(Instant::now());
+                return Err(error);
+            }
         }
-        let changed = self.try_change(put, remove, kept);
-        if changed.is_err() {
-            // Closes the file, so that it can be reopened.
-            (self.database, self.failed) = (None, Some(Instant::now()));
-        }
-        changed
+        Ok(())
     }
 
-    fn try_change(
-        &mut self,
-        put: &[&Mission],
-        remove: &[&str],
-        kept: &BTreeMap<String, Arc<Mission>>,
-    ) -> Result<(), DiskError> {
-        let database = match self.database.take() {
-            Some(database) => database,
-            None => {
-                let database = (self.opener)()?;
-                prepare(&database)?;
-                mirror(&database, kept)?;
-                database
-            }
-        };
-        write(&database, put, remove)?;
-        self.database = Some(database);
-        Ok(())
+    fn reopen(&self, kept: &Kept) -> Result<Database, DiskError> {
+        let database = (self.opener)()?;
+        prepare(&database)?;
+        mirror(&database, kept)?;
+        Ok(database)
     }
 }
 
@@ -192,9 +172,8 @@ fn prepare(database: &Database) -> Result<(), DiskError> {
     Ok(())
 }
 
-/// Makes the file equal to `kept`: removes a change that failed but was written, and restores every acknowledged mission even
-/// if the file was deleted.
-fn mirror(database: &Database, kept: &BTreeMap<String, Arc<Mission>>) -> Result<(), DiskError> {
+/// Makes the file equal to `kept`: removes a change that failed but was written, and restores acknowledged missions.
+fn mirror(database: &Database, kept: &Kept) -> Result<(), DiskError> {
     let (mut same, mut unknown) = (HashSet::new(), Vec::new());
     {
         let read = database.begin_read()?;

@@ -6,10 +6,10 @@
 
 mod sticky;
 
+use crate::UNASSIGNED;
 use crate::problem::Problem;
-use crate::{DispatchError, UNASSIGNED};
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy_allowed};
+use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy, pairs};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use std::cell::RefCell;
@@ -21,7 +21,7 @@ pub const GAP_CELLS: usize = 1_000_000;
 const KEPT_CELLS: usize = 300_000;
 
 /// An answer: a valid matching.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
     /// `[N]` goal of each agent, or [`UNASSIGNED`].
     pub goal_of: Vec<u32>,
@@ -35,22 +35,13 @@ pub struct Plan {
     pub exact_cost: Option<f64>,
     /// `[N]` cost of each agent's pair; 0 without one.
     pub pair_costs: Vec<f64>,
-    /// The members without a partner whose pairs are all forbidden.
-    pub isolated: Isolated,
-}
-
-/// Members whose pairs are all forbidden.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Isolated {
-    /// Agents, ascending.
-    pub agents: Vec<u32>,
-    /// Goals, ascending.
-    pub goals: Vec<u32>,
+    /// Agents, and goals, whose pairs are all forbidden, ascending.
+    pub isolated: [Vec<u32>; 2],
 }
 
 /// Buffers that are reused from problem to problem.
 #[derive(Debug, Default)]
-pub struct Workspace {
+struct Workspace {
     solver: Solver,
     makespan: BottleneckSolver,
     costs: Vec<f64>,
@@ -61,26 +52,51 @@ thread_local! {
     static WORKSPACE: RefCell<Workspace> = RefCell::default();
 }
 
-/// Solves with the buffers of this thread. `should_continue` is called from time to time.
-///
-/// # Errors
-/// [`DispatchError::Interrupted`] when `should_continue` returns false.
+/// Calls `work` with the buffers of this thread.
+fn with_workspace<T>(problem: &Problem, work: impl FnOnce(&mut Workspace) -> T) -> T {
+    WORKSPACE.with_borrow_mut(|workspace| {
+        let done = work(workspace);
+        if problem.cells() > KEPT_CELLS {
+            *workspace = Workspace::default();
+        }
+        done
+    })
+}
+
+/// Solves by a method; the exact one answers in place of the learned one. `should_continue` is called from time to time.
+/// It is interrupted when that returns false.
 pub fn solve(
     problem: &Problem,
     kind: AssignmentMethod,
     should_continue: &dyn Fn() -> bool,
-) -> Result<Plan, DispatchError> {
-    WORKSPACE.with_borrow_mut(|workspace| {
-        let plan = workspace.solve(problem, kind, should_continue);
-        workspace.forget();
-        plan
+) -> Result<Plan, AssignError> {
+    with_workspace(problem, |workspace| {
+        let (rows, cols) = (problem.agent_count, problem.goal_count);
+        problem.costs_into(&mut workspace.costs)?;
+        let sticky = workspace.adjust(problem);
+        let Workspace { solver, makespan, costs, adjusted } = workspace;
+        let target: &[f64] = if sticky { adjusted } else { costs };
+        let mut exact_cost = None;
+        let (goal_of, scheduler) = match kind {
+            AssignmentMethod::Exact | AssignmentMethod::Learned => {
+                let answer = solver.solve_allowed(target, rows, cols, should_continue)?;
+                exact_cost = (!sticky).then_some(answer.cost);
+                (answer.col_of_row, AssignmentMethod::Exact)
+            }
+            AssignmentMethod::Makespan => {
+                (makespan.solve_allowed(target, rows, cols, should_continue)?.col_of_row, kind)
+            }
+            AssignmentMethod::Greedy => (greedy(target, rows, cols, should_continue)?.col_of_row, kind),
+            AssignmentMethod::Random => {
+                let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
+                (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
+            }
+        };
+        workspace.finish(problem, Plan { goal_of, scheduler, exact_cost, ..Plan::default() }, should_continue)
     })
 }
 
-/// Makes a plan of the answer of the learned method.
-///
-/// # Errors
-/// Why it is not a valid matching, as the reason of a fallback.
+/// Makes a plan of the answer of the learned method. An error is the reason of a fallback.
 pub fn adopt(
     problem: &Problem,
     goals: Vec<Option<u32>>,
@@ -88,10 +104,16 @@ pub fn adopt(
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Plan, String> {
     check(problem, &goals, probabilities.as_deref())?;
-    WORKSPACE.with_borrow_mut(|workspace| {
-        let plan = workspace.adopt(problem, goals, probabilities, should_continue);
-        workspace.forget();
-        plan
+    let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
+    with_workspace(problem, |workspace| {
+        let cols = problem.goal_count;
+        problem.costs_into(&mut workspace.costs).map_err(|error| error.to_string())?;
+        let costs = &workspace.costs;
+        if let Some((agent, goal)) = pairs(&wish).find(|(agent, goal)| costs[agent * cols + goal] == f64::INFINITY) {
+            return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
+        }
+        let planned = workspace.follow(problem, &wish, probabilities, should_continue);
+        planned.map_err(|error| error.to_string())
     })
 }
 
@@ -110,73 +132,25 @@ pub fn learned_cells(problem: &Problem) -> usize {
 }
 
 impl Workspace {
-    fn forget(&mut self) {
-        self.solver.forget_beyond(KEPT_CELLS);
-        self.makespan.forget_beyond(KEPT_CELLS);
-        for buffer in [&mut self.costs, &mut self.adjusted] {
-            if buffer.capacity() > KEPT_CELLS {
-                *buffer = Vec::new();
-            }
-        }
-    }
-
-    fn solve(
+    /// Follows an allowed matching, except where leaving current pairs costs more than it saves.
+    fn follow(
         &mut self,
         problem: &Problem,
-        kind: AssignmentMethod,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, DispatchError> {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
-        problem.costs_into(&mut self.costs)?;
-        let sticky = self.adjust(problem);
-        let Self { solver, makespan, costs, adjusted } = self;
-        let target: &[f64] = if sticky { adjusted } else { costs };
-        let mut exact_cost = None;
-        let goal_of = match kind {
-            // Exact is the fallback of learned.
-            AssignmentMethod::Exact | AssignmentMethod::Learned => {
-                let answer = solver.solve_allowed(target, rows, cols, should_continue).map_err(refused)?;
-                exact_cost = (!sticky).then_some(answer.cost);
-                answer.col_of_row
-            }
-            AssignmentMethod::Makespan => {
-                makespan.solve_allowed(target, rows, cols, should_continue).map_err(refused)?.assignment.col_of_row
-            }
-            AssignmentMethod::Greedy => {
-                greedy_allowed(target, rows, cols, should_continue).map_err(refused)?.col_of_row
-            }
-            AssignmentMethod::Random => {
-                let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                random_allowed(costs, rows, cols, &mut stream, should_continue).map_err(refused)?
-            }
-        };
-        let kind = if kind == AssignmentMethod::Learned { AssignmentMethod::Exact } else { kind };
-        self.finish(problem, goal_of, None, kind, exact_cost, should_continue)
-    }
-
-    fn adopt(
-        &mut self,
-        problem: &Problem,
-        goals: Vec<Option<u32>>,
+        wish: &[u32],
         probabilities: Option<Vec<f32>>,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, String> {
-        let cols = problem.goal_count;
-        problem.costs_into(&mut self.costs).map_err(|error| error.to_string())?;
-        let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
-        let forbidden = pairs(&wish).find(|&(agent, goal)| self.costs[agent * cols + goal] == f64::INFINITY);
-        if let Some((agent, goal)) = forbidden {
-            return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
-        }
-        let mut goal_of = wish.clone();
-        if self.adjust(problem) {
-            goal_of = sticky::follow(&wish, &self.adjusted, cols, &problem.current, &mut self.solver, should_continue)
-                .map_err(|error| refused(error).to_string())?;
-        }
+    ) -> Result<Plan, AssignError> {
+        let goal_of = match self.adjust(problem) {
+            true => {
+                let Self { solver, adjusted, .. } = self;
+                sticky::follow(wish, adjusted, problem.goal_count, &problem.current, solver, should_continue)?
+            }
+            false => wish.to_vec(),
+        };
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
-        self.finish(problem, goal_of, probabilities, AssignmentMethod::Learned, None, should_continue)
-            .map_err(|error| error.to_string())
+        let scheduler = AssignmentMethod::Learned;
+        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, should_continue)
     }
 
     /// Fills the adjusted costs if there are current pairs.
@@ -192,69 +166,50 @@ impl Workspace {
         true
     }
 
+    /// Fills in the costs of a matching.
     fn finish(
         &mut self,
         problem: &Problem,
-        goal_of: Vec<u32>,
-        probabilities: Option<Vec<Option<f32>>>,
-        scheduler: AssignmentMethod,
-        exact_cost: Option<f64>,
+        mut plan: Plan,
         should_continue: &dyn Fn() -> bool,
-    ) -> Result<Plan, DispatchError> {
+    ) -> Result<Plan, AssignError> {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         let Self { solver, costs, .. } = self;
-        let cost = cost_of(costs, cols, &goal_of);
-        let exact_cost = match exact_cost {
-            Some(exact) => Some(exact),
-            None if rows * cols <= GAP_CELLS => {
-                match solver.solve_allowed(costs, rows, cols, should_continue) {
-                    Ok(exact) => (exact.pairs().count() == pairs(&goal_of).count()).then_some(exact.cost),
-                    // The answer is complete; only its gap is missing.
-                    Err(AssignError::Interrupted) => None,
-                    Err(other) => return Err(refused(other)),
+        plan.cost = cost_of(costs, cols, &plan.goal_of);
+        if plan.exact_cost.is_none() && rows * cols <= GAP_CELLS {
+            match solver.solve_allowed(costs, rows, cols, should_continue) {
+                Ok(exact) if exact.pairs().count() == pairs(&plan.goal_of).count() => {
+                    plan.exact_cost = Some(exact.cost)
                 }
+                // The answer is complete; only its gap is missing.
+                Ok(_) | Err(AssignError::Interrupted) => {}
+                Err(other) => return Err(other),
             }
-            None => None,
-        };
-        let cost_of_pair = |(agent, &goal): (usize, &u32)| match goal {
-            UNASSIGNED => 0.0,
-            goal => costs[agent * cols + goal as usize],
-        };
-        let pair_costs = goal_of.iter().enumerate().map(cost_of_pair).collect();
-        let isolated = if problem.forbidden.is_empty() { Isolated::default() } else { isolated(costs, rows, cols) };
-        Ok(Plan { goal_of, probabilities, scheduler, cost, exact_cost, pair_costs, isolated })
+        }
+        plan.pair_costs = vec![0.0; rows];
+        pairs(&plan.goal_of).for_each(|(agent, goal)| plan.pair_costs[agent] = costs[agent * cols + goal]);
+        if !problem.forbidden.is_empty() {
+            plan.isolated = isolated(costs, cols);
+        }
+        Ok(plan)
     }
 }
 
-fn isolated(costs: &[f64], rows: usize, cols: usize) -> Isolated {
-    let mut goals = vec![true; cols];
-    let mut found = Isolated::default();
-    for (agent, row) in costs.chunks_exact(cols).take(rows).enumerate() {
-        let mut none = true;
-        for (cost, goal) in row.iter().zip(&mut goals) {
+/// Agents, and goals, whose pairs are all forbidden.
+fn isolated(costs: &[f64], cols: usize) -> [Vec<u32>; 2] {
+    let (mut agents, mut lonely) = (Vec::new(), vec![true; cols]);
+    for (agent, row) in (0u32..).zip(costs.chunks_exact(cols)) {
+        let mut allowed = false;
+        for (cost, lonely) in row.iter().zip(&mut lonely) {
             if *cost < f64::INFINITY {
-                (none, *goal) = (false, false);
+                (allowed, *lonely) = (true, false);
             }
         }
-        if none {
-            found.agents.push(agent as u32);
+        if !allowed {
+            agents.push(agent);
         }
     }
-    found.goals = (0..cols as u32).filter(|&goal| goals[goal as usize]).collect();
-    found
-}
-
-/// (agent, goal) of every pair, agents ascending.
-pub(crate) fn pairs(goal_of: &[u32]) -> impl Iterator<Item = (usize, usize)> + '_ {
-    goal_of.iter().enumerate().filter(|(_, goal)| **goal != UNASSIGNED).map(|(agent, &goal)| (agent, goal as usize))
-}
-
-fn refused(error: AssignError) -> DispatchError {
-    match error {
-        AssignError::Interrupted => DispatchError::Interrupted,
-        // Impossible for a checked problem, but an error must not be lost.
-        other => DispatchError::invalid("costs", other.to_string()),
-    }
+    [agents, (0u32..).zip(lonely).filter_map(|(goal, lonely)| lonely.then_some(goal)).collect()]
 }
 
 /// Checks that the answer is a matching of min(N, G) pairs.

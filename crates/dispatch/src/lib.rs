@@ -13,25 +13,6 @@ pub mod engine;
 pub mod mission;
 pub mod missions;
 pub mod problem;
-pub mod view;
 
-pub use magex_assign::UNASSIGNED;
+pub use magex_assign::{AssignError, UNASSIGNED};
 pub use problem::{Limits, Problem};
-
-/// Why there is no assignment.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DispatchError {
-    /// A field of the request is invalid.
-    #[error(transparent)]
-    Invalid(#[from] magex_proto::convert::ConvertError),
-    /// The call ended or its deadline passed.
-    #[error("interrupted before an answer was found")]
-    Interrupted,
-}
-
-impl DispatchError {
-    /// A problem with a field.
-    pub fn invalid(field: impl Into<String>, problem: impl Into<String>) -> Self {
-        Self::Invalid(magex_proto::convert::ConvertError::new(field, problem))
-    }
-}

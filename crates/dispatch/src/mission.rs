@@ -4,11 +4,10 @@
 mod changes;
 mod members;
 
-use crate::engine::Plan;
-use crate::problem::{Problem, finite_cost, switching_cost};
-use crate::{DispatchError, UNASSIGNED, answer};
+use crate::answer::Planned;
+use crate::problem::{Problem, pairs, priced_pairs, switching_cost};
+use crate::{AssignError, UNASSIGNED};
 use changes::sentence;
-use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
@@ -31,22 +30,14 @@ pub struct MissionLimits {
     pub lifetime_ms: i64,
 }
 
-/// A plan and its origin.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Planned {
-    /// The plan.
-    pub plan: Plan,
-    /// Why another method than the requested one answered; empty otherwise.
-    pub fallback_reason: String,
-    /// Weights that answered: version, SHA-256, run.
-    pub weights: Option<(u32, String, String)>,
-}
-
 /// Solves a problem with the available methods.
-pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, DispatchError> + 'a;
+pub type Planner<'a> = dyn Fn(&Problem) -> Result<Planned, AssignError> + 'a;
 
 /// Names of an agent and of a goal.
 type Names = (String, String);
+
+/// Names of the agents and of the goals that an update removed.
+type Removed = [Vec<String>; 2];
 
 /// A mission and its current assignment.
 #[derive(Debug, Clone, PartialEq)]
@@ -85,9 +76,7 @@ impl Mission {
     }
 
     /// Creates and plans a mission. `drawn_id` is its name if the request has none; `now` is milliseconds since 1970.
-    ///
-    /// # Errors
-    /// The first invalid field, or the planner's error.
+    /// An error names the first invalid field, or is the planner's.
     pub fn create(
         request: v1::CreateMissionRequest,
         owner: &str,
@@ -95,24 +84,14 @@ impl Mission {
         now: i64,
         limits: &MissionLimits,
         planner: &Planner<'_>,
-    ) -> Result<Self, DispatchError> {
+    ) -> Result<Self, AssignError> {
         let id = if request.mission_id.is_empty() { drawn_id.to_owned() } else { request.mission_id };
         check_id(&id)?;
-        if request.title.len() > LONGEST_TITLE {
-            let problem = format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len());
-            return Err(DispatchError::invalid("title", problem));
-        }
-        check_lengths(
-            limits,
-            &[
-                ("agents", request.agents.len()),
-                ("goals", request.goals.len()),
-                ("forbidden", request.forbidden.len()),
-                ("cost_overrides", request.cost_overrides.len()),
-            ],
-        )?;
+        ConvertError::ensure(request.title.len() <= LONGEST_TITLE, || {
+            ("title", format!("{} bytes exceed the limit of {LONGEST_TITLE}", request.title.len()))
+        })?;
         let kind = sticky_scheduler(request.scheduler)?.unwrap_or(AssignmentMethod::Exact);
-        let mut mission = Self {
+        let empty = Self {
             assignment: v1::Assignment {
                 mission_id: id,
                 title: request.title,
@@ -127,25 +106,36 @@ impl Mission {
             overrides: BTreeMap::new(),
             lifetime_ms: lifetime(request.lifetime_seconds, limits)?,
         };
-        mission.upsert(request.agents, request.goals, limits)?;
-        mission.forbid("forbidden", &request.forbidden)?;
-        mission.price("cost_overrides", &request.cost_overrides)?;
-        mission.check_size(limits)?;
-        mission.plan(&Removed::default(), now, planner)?;
-        Ok(mission)
+        let content = v1::UpdateMissionRequest {
+            agents: request.agents,
+            goals: request.goals,
+            forbid: request.forbidden,
+            cost_overrides: request.cost_overrides,
+            ..Default::default()
+        };
+        empty.change("forbidden", content, now, limits, planner)
     }
 
-    /// Computes and plans the next revision; this one is unchanged.
-    ///
-    /// # Errors
-    /// The first invalid field, or the planner's error.
+    /// Computes and plans the next revision. An error names the first invalid field, or is the planner's.
     pub fn update(
         &self,
         request: v1::UpdateMissionRequest,
         now: i64,
         limits: &MissionLimits,
         planner: &Planner<'_>,
-    ) -> Result<Self, DispatchError> {
+    ) -> Result<Self, AssignError> {
+        self.clone().change("forbid", request, now, limits, planner)
+    }
+
+    /// Applies a request, in which `forbid` is the name of the list of pairs to forbid, and plans.
+    fn change(
+        mut self,
+        forbid: &str,
+        request: v1::UpdateMissionRequest,
+        now: i64,
+        limits: &MissionLimits,
+        planner: &Planner<'_>,
+    ) -> Result<Self, AssignError> {
         check_lengths(
             limits,
             &[
@@ -153,36 +143,34 @@ impl Mission {
                 ("goals", request.goals.len()),
                 ("remove_agents", request.remove_agents.len()),
                 ("remove_goals", request.remove_goals.len()),
-                ("forbid", request.forbid.len()),
+                (forbid, request.forbid.len()),
                 ("allow", request.allow.len()),
                 ("cost_overrides", request.cost_overrides.len()),
                 ("clear_cost_overrides", request.clear_cost_overrides.len()),
             ],
         )?;
-        let mut next = self.clone();
-        let removed = next.remove(&request.remove_agents, &request.remove_goals)?;
-        next.upsert(request.agents, request.goals, limits)?;
-        next.forbid("forbid", &request.forbid)?;
-        let known = MemberNames::of(&next.assignment);
-        for (k, pair) in request.allow.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("allow[{k}]")))?;
-            next.forbidden.remove(&names);
+        let removed = [request.remove_agents, request.remove_goals];
+        self.remove(&removed)?;
+        self.upsert(request.agents, request.goals, limits)?;
+        let known = MemberNames::of(&self.assignment);
+        let names = |pair: &v1::PairRef| known.names(pair);
+        self.forbidden.extend(pairs(forbid, &request.forbid, names)?);
+        for allowed in pairs("allow", &request.allow, names)? {
+            self.forbidden.remove(&allowed);
         }
-        next.price("cost_overrides", &request.cost_overrides)?;
-        let known = MemberNames::of(&next.assignment);
-        for (k, pair) in request.clear_cost_overrides.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("clear_cost_overrides[{k}]")))?;
-            next.overrides.remove(&names);
+        self.overrides.extend(priced_pairs("cost_overrides", &request.cost_overrides, names)?);
+        for cleared in pairs("clear_cost_overrides", &request.clear_cost_overrides, names)? {
+            self.overrides.remove(&cleared);
         }
         if let Some(cost) = request.switching_cost {
-            next.assignment.switching_cost = switching_cost(cost)?;
+            self.assignment.switching_cost = switching_cost(cost)?;
         }
         if let Some(kind) = sticky_scheduler(request.scheduler)? {
-            next.assignment.scheduler = v1::AssignmentMethod::from(kind).into();
+            self.assignment.scheduler = v1::AssignmentMethod::from(kind).into();
         }
-        next.check_size(limits)?;
-        next.plan(&removed, now, planner)?;
-        Ok(next)
+        self.check_size(limits)?;
+        self.plan(&removed, now, planner)?;
+        Ok(self)
     }
 
     /// Its name.
@@ -197,23 +185,17 @@ impl Mission {
             goal_id: goal.clone(),
             ..Default::default()
         };
+        let priced = |(names, &cost): (&Names, &f64)| v1::PairCost { pair: Some(pair(names)), cost };
         let record = Record {
             assignment: Some(self.assignment.clone()),
             forbidden: self.forbidden.iter().map(pair).collect(),
-            overrides: self
-                .overrides
-                .iter()
-                .map(|(names, &cost)| v1::PairCost { pair: Some(pair(names)), cost })
-                .collect(),
+            overrides: self.overrides.iter().map(priced).collect(),
             lifetime_ms: self.lifetime_ms,
         };
         prost::Message::encode_to_vec(&record)
     }
 
-    /// Decodes a record on disk.
-    ///
-    /// # Errors
-    /// The bytes are no record, or not that of a valid mission.
+    /// Decodes a record on disk. It must be that of a valid mission.
     pub fn decode(bytes: &[u8]) -> Result<Self, ConvertError> {
         let record: Record =
             prost::Message::decode(bytes).map_err(|error| ConvertError::new("mission", error.to_string()))?;
@@ -234,7 +216,7 @@ impl Mission {
         agents: Vec<v1::Member>,
         goals: Vec<v1::Member>,
         limits: &MissionLimits,
-    ) -> Result<(), DispatchError> {
+    ) -> Result<(), AssignError> {
         let first = |members: &[v1::Member]| members.iter().map(|member| member.position.len()).find(|&len| len > 0);
         let a = &mut self.assignment;
         let dims = first(&a.agents).or(first(&a.goals)).or(first(&agents)).or(first(&goals)).unwrap_or(2);
@@ -243,49 +225,26 @@ impl Mission {
         Ok(())
     }
 
-    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Removed, DispatchError> {
+    fn remove(&mut self, [agents, goals]: &Removed) -> Result<(), AssignError> {
         let a = &mut self.assignment;
         for (field, members, ids) in [("remove_agents", &mut a.agents, agents), ("remove_goals", &mut a.goals, goals)] {
             let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
             if let Some(k) = ids.iter().position(|id| !left.remove(id.as_str())) {
-                return Err(DispatchError::invalid(format!("{field}[{k}]"), "no member has this name"));
+                return Err(AssignError::invalid(format!("{field}[{k}]"), "no member has this name"));
             }
             let ids: HashSet<&str> = ids.iter().map(String::as_str).collect();
             members.retain(|member| !ids.contains(member.id.as_str()));
         }
-        let removed = Removed { agents: agents.to_vec(), goals: goals.to_vec() };
         let (agents, goals): (HashSet<&String>, HashSet<&String>) = (agents.iter().collect(), goals.iter().collect());
         self.forbidden.retain(|(agent, goal)| !agents.contains(agent) && !goals.contains(goal));
         self.overrides.retain(|(agent, goal), _| !agents.contains(agent) && !goals.contains(goal));
-        Ok(removed)
-    }
-
-    fn forbid(&mut self, field: &str, pairs: &[v1::PairRef]) -> Result<(), DispatchError> {
-        let known = MemberNames::of(&self.assignment);
-        for (k, pair) in pairs.iter().enumerate() {
-            let names = known.names(pair).map_err(|e| e.within(&format!("{field}[{k}]")))?;
-            self.forbidden.insert(names);
-        }
         Ok(())
     }
 
-    fn price(&mut self, field: &str, items: &[v1::PairCost]) -> Result<(), DispatchError> {
-        let known = MemberNames::of(&self.assignment);
-        for (k, item) in items.iter().enumerate() {
-            let path = format!("{field}[{k}]");
-            let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{path}.pair")))?;
-            let names = known.names(pair).map_err(|e| e.within(&format!("{path}.pair")))?;
-            self.overrides.insert(names, finite_cost(item.cost, || format!("{path}.cost"))?);
-        }
-        Ok(())
-    }
-
-    fn check_size(&self, limits: &MissionLimits) -> Result<(), DispatchError> {
+    fn check_size(&self, limits: &MissionLimits) -> Result<(), AssignError> {
         let most = most_pairs(limits);
         for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
-            if count > most {
-                return Err(DispatchError::invalid(field, format!("{count} pairs exceed the limit of {most}")));
-            }
+            ConvertError::ensure(count <= most, || (field, format!("{count} pairs exceed the limit of {most}")))?;
         }
         Ok(())
     }
@@ -310,74 +269,61 @@ impl Mission {
         for (row, col) in a.pairs.iter().filter_map(|pair| find(&pair.agent_id, &pair.goal_id)) {
             current[row as usize] = col;
         }
+        let priced = self.overrides.iter().filter_map(|((agent, goal), &cost)| {
+            let (row, col) = find(agent, goal)?;
+            Some((row, col, cost))
+        });
+        let dims = a.agents[agents[0]].position.len();
         let problem = Problem {
-            agent_count: agents.len(),
-            goal_count: goals.len(),
-            dims: a.agents[agents[0]].position.len(),
-            agents: points(&a.agents, &agents),
-            goals: points(&a.goals, &goals),
-            agent_ids: Vec::new(),
-            goal_ids: Vec::new(),
-            matrix: None,
-            overrides: self
-                .overrides
-                .iter()
-                .filter_map(|((agent, goal), &cost)| find(agent, goal).map(|(row, col)| (row, col, cost)))
-                .collect(),
+            overrides: priced.collect(),
             forbidden: self.forbidden.iter().filter_map(|(agent, goal)| find(agent, goal)).collect(),
             current,
             switching_cost: a.switching_cost,
             scheduler: a.scheduler().into(),
-            mode: Mode::Greedy,
             seed: a.revision,
-            deadline: None,
+            ..Problem::of_points(points(&a.agents, &agents), points(&a.goals, &goals), dims)
         };
         Some((problem, agents, goals))
     }
 
-    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), DispatchError> {
-        let before = std::mem::take(&mut self.assignment.pairs);
-        // The problem reads the current pairs.
-        self.assignment.pairs.clone_from(&before);
+    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), AssignError> {
+        let before = self.assignment.pairs.clone();
         let solved = match self.problem() {
-            Some((problem, agents, goals)) => {
-                let planned = planner(&problem)?;
-                Some((problem, planned, agents, goals))
-            }
+            Some((problem, agents, goals)) => Some((planner(&problem)?.respond(&problem), agents, goals)),
             None => None,
         };
         let a = &mut self.assignment;
         a.revision += 1;
         a.updated_ms = now;
         a.expires_ms = now.saturating_add(self.lifetime_ms);
-        (a.pairs, a.cost, a.largest_cost) = (Vec::new(), 0.0, 0.0);
-        (a.exact_cost, a.gap, a.saving) = (Some(0.0), Some(0.0), None);
-        a.answered_by = a.scheduler;
-        (a.fallback_reason, a.version, a.sha256, a.run_id) = Default::default();
-        let (mut idle_agents, mut idle_goals) = (BTreeMap::new(), BTreeMap::new());
-        if let Some((problem, planned, agents, goals)) = &solved {
-            let response = answer::write(problem, &planned.plan);
-            (a.cost, a.largest_cost) = (response.cost, response.largest_cost);
-            (a.exact_cost, a.gap) = (response.exact_cost, response.gap);
-            a.answered_by = response.scheduler;
-            a.fallback_reason.clone_from(&planned.fallback_reason);
-            if let Some((version, sha256, run)) = planned.weights.clone() {
-                (a.version, a.sha256, a.run_id) = (version, sha256, run);
+        let mut reasons = None;
+        let response = match solved {
+            Some((mut response, agents, goals)) => {
+                for pair in &mut response.pairs {
+                    let (agent, goal) = (agents[pair.agent_index as usize], goals[pair.goal_index as usize]);
+                    (pair.agent_index, pair.goal_index) = (agent as u32, goal as u32);
+                    (pair.agent_id, pair.goal_id) = (a.agents[agent].id.clone(), a.goals[goal].id.clone());
+                }
+                let placed = |left: &[v1::Unassigned], places: &[usize]| -> BTreeMap<usize, i32> {
+                    left.iter().map(|member| (places[member.index as usize], member.reason)).collect()
+                };
+                let (agents, goals) =
+                    (placed(&response.agents_without_goal, &agents), placed(&response.goals_without_agent, &goals));
+                reasons = Some((agents, goals));
+                response
             }
-            for mut pair in response.pairs {
-                let (agent, goal) = (agents[pair.agent_index as usize], goals[pair.goal_index as usize]);
-                (pair.agent_index, pair.goal_index) = (agent as u32, goal as u32);
-                (pair.agent_id, pair.goal_id) = (a.agents[agent].id.clone(), a.goals[goal].id.clone());
-                a.pairs.push(pair);
+            None => {
+                let (exact_cost, scheduler) = (Some(0.0), a.scheduler);
+                v1::AssignResponse { exact_cost, gap: exact_cost, scheduler, ..Default::default() }
             }
-            idle_agents = response.agents_without_goal.iter().map(|u| (agents[u.index as usize], u.reason)).collect();
-            idle_goals = response.goals_without_agent.iter().map(|u| (goals[u.index as usize], u.reason)).collect();
-        }
-        let paired = |side: fn(&v1::Pair) -> u32, pairs: &[v1::Pair]| -> BTreeSet<usize> {
-            pairs.iter().map(|pair| side(pair) as usize).collect()
         };
-        a.agents_without_goal = idle(&a.agents, &paired(|p| p.agent_index, &a.pairs), &idle_agents);
-        a.goals_without_agent = idle(&a.goals, &paired(|p| p.goal_index, &a.pairs), &idle_goals);
+        (a.pairs, a.cost, a.largest_cost) = (response.pairs, response.cost, response.largest_cost);
+        (a.exact_cost, a.gap, a.answered_by) = (response.exact_cost, response.gap, response.scheduler);
+        a.fallback_reason = response.fallback_reason;
+        (a.version, a.sha256, a.run_id) = (response.version, response.sha256, response.run_id);
+        let (agents, goals) = reasons.unzip();
+        a.agents_without_goal = idle(&a.agents, agents.as_ref());
+        a.goals_without_agent = idle(&a.goals, goals.as_ref());
         self.explain(&before, removed);
         Ok(())
     }
@@ -394,12 +340,9 @@ impl Mission {
     }
 
     /// Fills in the changes against `before`, with their reasons.
-    fn explain(&mut self, before: &[v1::Pair], removed: &Removed) {
+    fn explain(&mut self, before: &[v1::Pair], [removed_agents, removed_goals]: &Removed) {
         let a = &self.assignment;
-        let member = |members: &[v1::Member]| -> HashMap<String, v1::Member> {
-            members.iter().map(|m| (m.id.clone(), m.clone())).collect()
-        };
-        let (agents, goals) = (member(&a.agents), member(&a.goals));
+        let (agents, goals) = (by_id(&a.agents), by_id(&a.goals));
         let cost = |agent: &str, goal: &str| self.cost_of(agents.get(agent)?, goals.get(goal)?);
         let old: BTreeMap<&str, &str> = before.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
         let new: BTreeMap<&str, &str> = a.pairs.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
@@ -412,28 +355,25 @@ impl Mission {
             if from == to {
                 continue;
             }
-            let state = |members: &HashMap<String, v1::Member>, id: &str| members.get(id).map(v1::Member::state);
-            let reason = match from {
-                None => v1::ChangeReason::Assigned,
-                Some(goal) => {
-                    match (state(&agents, agent), state(&goals, goal), removed.goals.iter().any(|id| id == goal)) {
-                        (None, ..) => v1::ChangeReason::AgentRemoved,
-                        (Some(v1::MemberState::Failed), ..) => v1::ChangeReason::AgentFailed,
-                        (Some(v1::MemberState::Finished), ..) => v1::ChangeReason::AgentFinished,
-                        (_, None, _) | (_, _, true) => v1::ChangeReason::GoalRemoved,
-                        (_, Some(v1::MemberState::Failed), _) => v1::ChangeReason::GoalFailed,
-                        (_, Some(v1::MemberState::Finished), _) => v1::ChangeReason::GoalFinished,
-                        _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
-                            v1::ChangeReason::PairForbidden
-                        }
-                        _ if to.is_none() => v1::ChangeReason::Displaced,
-                        _ => v1::ChangeReason::Switched,
+            let state = |members: &HashMap<&str, &v1::Member>, id: &str| members.get(id).map(|member| member.state());
+            let gone = |removed: &[String], id: &str| removed.iter().any(|other| other == id);
+            let reason = match (from, state(&agents, agent)) {
+                (None, _) => v1::ChangeReason::Assigned,
+                (_, None) => v1::ChangeReason::AgentRemoved,
+                _ if gone(removed_agents, agent) => v1::ChangeReason::AgentRemoved,
+                (_, Some(v1::MemberState::Failed)) => v1::ChangeReason::AgentFailed,
+                (_, Some(v1::MemberState::Finished)) => v1::ChangeReason::AgentFinished,
+                (Some(goal), _) => match state(&goals, goal) {
+                    None => v1::ChangeReason::GoalRemoved,
+                    _ if gone(removed_goals, goal) => v1::ChangeReason::GoalRemoved,
+                    Some(v1::MemberState::Failed) => v1::ChangeReason::GoalFailed,
+                    Some(v1::MemberState::Finished) => v1::ChangeReason::GoalFinished,
+                    _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
+                        v1::ChangeReason::PairForbidden
                     }
-                }
-            };
-            let reason = match removed.agents.iter().any(|id| id == agent) && from.is_some() {
-                true => v1::ChangeReason::AgentRemoved,
-                false => reason,
+                    _ if to.is_none() => v1::ChangeReason::Displaced,
+                    _ => v1::ChangeReason::Switched,
+                },
             };
             let gain = from.zip(to).and_then(|(from, to)| Some(cost(agent, from)? - cost(agent, to)?));
             changes.push(v1::Change {
@@ -449,24 +389,20 @@ impl Mission {
     }
 }
 
-/// Members that an update removed.
-#[derive(Debug, Default)]
-struct Removed {
-    agents: Vec<String>,
-    goals: Vec<String>,
+fn by_id(members: &[v1::Member]) -> HashMap<&str, &v1::Member> {
+    members.iter().map(|member| (member.id.as_str(), member)).collect()
 }
 
-/// Members without a partner: inactive ones, and those that the plan left unassigned. If a side is empty, the other one
-/// outnumbers it.
-fn idle(members: &[v1::Member], paired: &BTreeSet<usize>, reasons: &BTreeMap<usize, i32>) -> Vec<v1::Unassigned> {
-    let without = members.iter().enumerate().filter(|(k, _)| !paired.contains(k));
-    without
-        .map(|(k, member)| {
-            let reason = match member.state() {
-                v1::MemberState::Active => reasons.get(&k).copied().unwrap_or(v1::UnassignedReason::Outnumbered.into()),
-                _ => v1::UnassignedReason::Inactive.into(),
-            };
-            v1::Unassigned { index: k as u32, id: member.id.clone(), reason }
-        })
-        .collect()
+/// Members without a partner: inactive ones, and those that the plan left unassigned, with its `reasons`. Without a plan a side is
+/// empty, so that the other one outnumbers it.
+fn idle(members: &[v1::Member], reasons: Option<&BTreeMap<usize, i32>>) -> Vec<v1::Unassigned> {
+    let idle = |(k, member): (usize, &v1::Member)| {
+        let reason = match (member.state(), reasons) {
+            (v1::MemberState::Active, Some(reasons)) => *reasons.get(&k)?,
+            (v1::MemberState::Active, None) => v1::UnassignedReason::Outnumbered.into(),
+            _ => v1::UnassignedReason::Inactive.into(),
+        };
+        Some(v1::Unassigned { index: k as u32, id: member.id.clone(), reason })
+    };
+    members.iter().enumerate().filter_map(idle).collect()
 }

@@ -1,12 +1,11 @@
 //! All missions of a service, in memory and optionally on disk, bounded in number and age. Readers never wait for the disk.
 //!
-//! An update computes revision r + 1 from revision r, writes it to disk, and commits it only if r is still current (optimistic
-//! concurrency). Otherwise the caller re-plans.
+//! An update writes revision r + 1 and commits it only if r is still current; otherwise the caller re-plans.
 
-use crate::disk::{Disk, DiskError};
+use crate::disk::{Disk, DiskError, Kept};
 use crate::mission::{Mission, MissionLimits};
 use magex_proto::v1;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 /// Limits of the missions of a service.
@@ -59,32 +58,12 @@ pub enum KeepError {
     Disk(#[from] DiskError),
 }
 
-/// By name.
-type Kept = BTreeMap<String, Arc<Mission>>;
-
-/// Where changes are stored.
-#[derive(Debug)]
-enum Journal {
-    /// In memory only: missions are lost when the process ends.
-    Memory,
-    Disk(Disk),
-    Closed,
-}
-
-impl Journal {
-    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), KeepError> {
-        match self {
-            Self::Memory => Ok(()),
-            Self::Disk(disk) => Ok(disk.change(put, remove, kept)?),
-            Self::Closed => Err(KeepError::Closed),
-        }
-    }
-}
-
 /// The state that only changes use.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct WriteState {
-    journal: Journal,
+    /// Without a file, missions are lost when the process ends.
+    disk: Option<Disk>,
+    closed: bool,
     /// Bytes of each mission, of each owner's, and of all.
     sizes: HashMap<String, usize>,
     owners: HashMap<String, usize>,
@@ -92,6 +71,15 @@ struct WriteState {
 }
 
 impl WriteState {
+    /// Writes a change to the file.
+    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), KeepError> {
+        match &mut self.disk {
+            _ if self.closed => Err(KeepError::Closed),
+            Some(disk) => Ok(disk.change(put, remove, kept)?),
+            None => Ok(()),
+        }
+    }
+
     /// Sets the size of a mission; `None` when it is removed. A mission never changes its owner.
     fn resize(&mut self, mission: &Mission, size: Option<usize>) {
         let (id, owner) = (mission.id(), mission.assignment.owner.as_str());
@@ -119,18 +107,15 @@ pub struct Missions {
     kept: RwLock<Kept>,
     /// Held by a change from its check to the end of its write.
     writing: Mutex<WriteState>,
-    bounds: Bounds,
+    /// The limits.
+    pub bounds: Bounds,
 }
 
 impl Missions {
     /// Loads the missions of a file; without a file they are lost when the process ends.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub fn open(disk: Option<Disk>, bounds: Bounds) -> Result<Self, DiskError> {
         let loaded = disk.as_ref().map(Disk::load).transpose()?.unwrap_or_default();
-        let journal = disk.map_or(Journal::Memory, Journal::Disk);
-        let mut writing = WriteState { journal, sizes: HashMap::new(), owners: HashMap::new(), bytes: 0 };
+        let mut writing = WriteState { disk, ..WriteState::default() };
         loaded.iter().for_each(|mission| writing.resize(mission, Some(mission.bytes())));
         let kept = loaded.into_iter().map(|mission| (mission.id().to_owned(), Arc::new(mission))).collect();
         Ok(Self { kept: RwLock::new(kept), writing: Mutex::new(writing), bounds })
@@ -138,12 +123,7 @@ impl Missions {
 
     /// Number of missions.
     pub fn count(&self) -> usize {
-        self.kept.read().unwrap_or_else(PoisonError::into_inner).len()
-    }
-
-    /// The limits.
-    pub fn bounds(&self) -> &Bounds {
-        &self.bounds
+        self.read().len()
     }
 
     /// The mission of this name.
@@ -163,10 +143,7 @@ impl Missions {
             .collect()
     }
 
-    /// Stores a new mission.
-    ///
-    /// # Errors
-    /// Its name is in use, a limit is reached, or the write failed.
+    /// Stores a new mission. Fails if its name is in use, a limit is reached, or the write failed.
     pub fn insert(&self, mission: Mission) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         {
@@ -180,67 +157,48 @@ impl Missions {
     }
 
     /// Whether one more mission of this owner may be stored.
-    ///
-    /// # Errors
-    /// [`KeepError::Full`].
     pub fn check_room(&self, owner: &str) -> Result<(), KeepError> {
         self.room(&self.read(), owner)
     }
 
     fn room(&self, kept: &Kept, owner: &str) -> Result<(), KeepError> {
-        if kept.len() >= self.bounds.total {
-            return Err(KeepError::Full(format!(
-                "the service is at its limit of {} missions; delete some",
-                self.bounds.total
-            )));
-        }
         let own = kept.values().filter(|mission| mission.assignment.owner == owner).count();
-        if own >= self.bounds.per_owner {
-            return Err(KeepError::Full(format!(
-                "the client is at its limit of {} missions; delete some",
-                self.bounds.per_owner
-            )));
+        let (total, per_owner) = (self.bounds.total, self.bounds.per_owner);
+        for (who, count, most) in [("service", kept.len(), total), ("client", own, per_owner)] {
+            if count >= most {
+                return Err(KeepError::Full(format!("the {who} is at its limit of {most} missions; delete some")));
+            }
         }
         Ok(())
     }
 
-    /// Stores the successor of the mission's revision `was`.
-    ///
-    /// # Errors
-    /// The mission was deleted or has another revision, or the write failed.
+    /// Stores the successor of the mission's revision `was`. Fails if it was deleted or has another one.
     pub fn replace(&self, mission: Mission, was: u64) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         // Another owner's mission of the same name must look like a missing one.
         match self.get(mission.id()).filter(|now| now.assignment.owner == mission.assignment.owner) {
-            None => return Err(KeepError::Missing(mission.id().to_owned())),
+            None => Err(KeepError::Missing(mission.id().to_owned())),
             Some(now)
-                if now.assignment.revision != was || now.assignment.created_ms != mission.assignment.created_ms =>
+                if (now.assignment.revision, now.assignment.created_ms) == (was, mission.assignment.created_ms) =>
             {
-                return Err(KeepError::Changed { id: mission.id().to_owned(), found: now.assignment.revision });
+                self.put(&mut writing, mission)
             }
-            Some(_) => {}
+            Some(now) => Err(KeepError::Changed { id: mission.id().to_owned(), found: now.assignment.revision }),
         }
-        self.put(&mut writing, mission)
     }
 
-    /// Deletes a mission if `may` allows it. Check and deletion are atomic.
-    ///
-    /// # Errors
-    /// There is no such mission, or `may` returned false (the same error), or the write failed.
+    /// Deletes a mission if `may` allows it. Check and deletion are atomic. Without permission the mission seems to be missing.
     pub fn remove(&self, id: &str, may: impl FnOnce(&Mission) -> bool) -> Result<Arc<Mission>, KeepError> {
         let mut writing = self.lock();
         let found = self.get(id).filter(|mission| may(mission));
         let mission = found.ok_or_else(|| KeepError::Missing(id.to_owned()))?;
-        writing.journal.change(&[], &[id], &self.read())?;
+        writing.change(&[], &[id], &self.read())?;
         writing.resize(&mission, None);
         self.write().remove(id);
         Ok(mission)
     }
 
     /// Deletes the missions that have expired at `now` (milliseconds since 1970), and returns them.
-    ///
-    /// # Errors
-    /// The write failed.
     pub fn expire(&self, now: i64) -> Result<Vec<Arc<Mission>>, KeepError> {
         let mut writing = self.lock();
         let old: Vec<Arc<Mission>> =
@@ -249,7 +207,7 @@ impl Missions {
             return Ok(old);
         }
         let ids: Vec<&str> = old.iter().map(|mission| mission.id()).collect();
-        writing.journal.change(&[], &ids, &self.read())?;
+        writing.change(&[], &ids, &self.read())?;
         old.iter().for_each(|mission| writing.resize(mission, None));
         let mut kept = self.write();
         ids.iter().for_each(|id| drop(kept.remove(*id)));
@@ -259,7 +217,8 @@ impl Missions {
 
     /// Closes the file; further changes fail.
     pub fn close(&self) {
-        self.lock().journal = Journal::Closed;
+        let mut writing = self.lock();
+        (writing.disk, writing.closed) = (None, true);
     }
 
     fn put(&self, writing: &mut WriteState, mission: Mission) -> Result<Arc<Mission>, KeepError> {
@@ -280,7 +239,7 @@ impl Missions {
                 }
             }
         }
-        writing.journal.change(&[&mission], &[], &self.read())?;
+        writing.change(&[&mission], &[], &self.read())?;
         writing.resize(&mission, Some(size));
         let mission = Arc::new(mission);
         self.write().insert(mission.id().to_owned(), mission.clone());

@@ -1,6 +1,6 @@
 //! Parses and checks a request for one team.
 
-use magex_assign::{UNASSIGNED, distance, distances_into};
+use magex_assign::{AssignError, UNASSIGNED, distance, distances_into};
 use magex_core::ids::Mode;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
@@ -33,7 +33,7 @@ impl Default for Limits {
 }
 
 /// The assignment problem of one team. All values are finite and in range.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Problem {
     /// N.
     pub agent_count: usize,
@@ -70,56 +70,51 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// Parses a request. `seed` is the seed of a request without one.
-    ///
-    /// # Errors
-    /// The first invalid field, by its path.
+    /// The problem of these positions (`[N, dims]` and `[G, dims]`, world units), without names, costs and current pairs.
+    pub fn of_points(agents: Vec<f32>, goals: Vec<f32>, dims: usize) -> Self {
+        Self {
+            agent_count: agents.len() / dims.max(1),
+            goal_count: goals.len() / dims.max(1),
+            dims,
+            agents,
+            goals,
+            ..Self::default()
+        }
+    }
+
+    /// Parses a request. `seed` is the seed of a request without one. An error names the first invalid field by its path.
     pub fn read(message: v1::AssignRequest, seed: u64, limits: &Limits) -> Result<Self, ConvertError> {
-        let scheduler = scheduler("scheduler", message.scheduler)?.unwrap_or_default();
+        let scheduler = scheduler(message.scheduler)?.unwrap_or_default();
         let mode = match v1::Mode::try_from(message.mode) {
             Ok(v1::Mode::Sampled) => Mode::Sampled,
             Ok(v1::Mode::Greedy | v1::Mode::Unspecified) => Mode::Greedy,
             Err(_) => {
-                return Err(ConvertError::new(
-                    "mode",
-                    format!("{} is not a mode; use sampled or greedy", message.mode),
-                ));
+                let problem = format!("{} is not a mode; use sampled or greedy", message.mode);
+                return Err(ConvertError::new("mode", problem));
             }
         };
         let positions = match (message.agents, message.goals) {
             (None, None) if message.costs.is_some() => None,
             (agents, goals) => Some((points("agents", agents, limits)?, points("goals", goals, limits)?)),
         };
-        if let Some(((_, agents), (_, goals))) = &positions
-            && agents != goals
-        {
-            return Err(ConvertError::new("goals", format!("{goals} dimensions, the agents have {agents}")));
-        }
-        let dims = positions.as_ref().map_or(0, |(agents, _)| agents.1);
-        let counts = positions.as_ref().map(|((agents, d), (goals, _))| (agents.len() / d, goals.len() / d));
+        let ((agents, dims), (goals, goal_dims)) = positions.unwrap_or_default();
+        ConvertError::ensure(dims == goal_dims, || {
+            ("goals", format!("{goal_dims} dimensions, the agents have {dims}"))
+        })?;
+        let counts = (dims > 0).then(|| (agents.len() / dims, goals.len() / dims));
         let (matrix, (agent_count, goal_count)) = match (message.costs, counts) {
             (Some(costs), counts) => {
-                let (values, shape) = matrix(costs, counts, limits)?;
-                (Some(values), shape)
+                let shape = check_matrix(&costs, counts, limits)?;
+                (Some(costs.values), shape)
             }
             (None, Some(counts)) => (None, counts),
             (None, None) => return Err(ConvertError::missing("agents")),
         };
-        let (agents, goals) = positions.map_or_else(Default::default, |((agents, _), (goals, _))| (agents, goals));
         let agent_index = index("agent_ids", &message.agent_ids, agent_count)?;
         let goal_index = index("goal_ids", &message.goal_ids, goal_count)?;
         let sides = Sides { agents: (&agent_index, agent_count), goals: (&goal_index, goal_count) };
-        let mut overrides = Vec::with_capacity(message.cost_overrides.len());
-        for (k, item) in message.cost_overrides.iter().enumerate() {
-            let path = || format!("cost_overrides[{k}]");
-            let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(format!("{}.pair", path())))?;
-            let (agent, goal) = sides.resolve(pair).map_err(|e| e.within(&format!("{}.pair", path())))?;
-            overrides.push((agent, goal, finite_cost(item.cost, || format!("{}.cost", path()))?));
-        }
-        let mut forbidden = Vec::with_capacity(message.forbidden.len());
-        for (k, pair) in message.forbidden.iter().enumerate() {
-            forbidden.push(sides.resolve(pair).map_err(|e| e.within(&format!("forbidden[{k}]")))?);
-        }
+        let resolve = |pair: &v1::PairRef| sides.resolve(pair);
+        let overrides = priced_pairs("cost_overrides", &message.cost_overrides, resolve)?;
         let current = current(&message.current, &sides)?;
         Ok(Self {
             agent_count,
@@ -128,8 +123,8 @@ impl Problem {
             agents,
             goals,
             matrix,
-            overrides,
-            forbidden,
+            overrides: overrides.into_iter().map(|((agent, goal), cost)| (agent, goal, cost)).collect(),
+            forbidden: pairs("forbidden", &message.forbidden, resolve)?,
             current,
             switching_cost: switching_cost(message.switching_cost)?,
             scheduler,
@@ -147,16 +142,10 @@ impl Problem {
     }
 
     /// Costs `[N, G]`: the matrix or the distances, then single costs, then +∞ for forbidden pairs.
-    pub fn costs_into(&self, costs: &mut Vec<f64>) -> Result<(), ConvertError> {
+    pub fn costs_into(&self, costs: &mut Vec<f64>) -> Result<(), AssignError> {
         match &self.matrix {
-            Some(matrix) => {
-                costs.clear();
-                costs.extend_from_slice(matrix);
-            }
-            None => {
-                distances_into(&self.agents, &self.goals, self.dims, costs)
-                    .map_err(|error| ConvertError::new("agents", error.to_string()))?;
-            }
+            Some(matrix) => costs.clone_from(matrix),
+            None => drop(distances_into(&self.agents, &self.goals, self.dims, costs)?),
         }
         for &(agent, goal, cost) in &self.overrides {
             costs[agent as usize * self.goal_count + goal as usize] = cost;
@@ -176,38 +165,36 @@ impl Problem {
 }
 
 /// A known method; `None` if unspecified.
-pub(crate) fn scheduler(field: &str, value: i32) -> Result<Option<AssignmentMethod>, ConvertError> {
+pub(crate) fn scheduler(value: i32) -> Result<Option<AssignmentMethod>, ConvertError> {
     match v1::AssignmentMethod::try_from(value) {
         Ok(v1::AssignmentMethod::Unspecified) => Ok(None),
         Ok(kind) => Ok(Some(kind.into())),
-        Err(_) => Err(ConvertError::new(
-            field,
-            format!("{value} is not a method; use learned, exact, makespan, greedy or random"),
-        )),
+        Err(_) => {
+            let problem = format!("{value} is not a method; use learned, exact, makespan, greedy or random");
+            Err(ConvertError::new("scheduler", problem))
+        }
     }
 }
 
 pub(crate) fn switching_cost(value: f64) -> Result<f64, ConvertError> {
-    if (0.0..=LARGEST_COST).contains(&value) {
-        return Ok(value);
-    }
-    Err(ConvertError::new("switching_cost", format!("{value} is not a number from 0 to {LARGEST_COST:e}")))
+    let ok = (0.0..=LARGEST_COST).contains(&value);
+    ConvertError::ensure(ok, || ("switching_cost", format!("{value} is not a number from 0 to {LARGEST_COST:e}")))?;
+    Ok(value)
 }
 
 pub(crate) fn finite_cost(value: f64, field: impl FnOnce() -> String) -> Result<f64, ConvertError> {
     // False for NaN.
-    if value.abs() <= LARGEST_COST {
-        return Ok(value);
-    }
-    Err(ConvertError::new(field(), format!("{value} is not a finite number up to {LARGEST_COST:e}")))
+    let ok = value.abs() <= LARGEST_COST;
+    ConvertError::ensure(ok, || (field(), format!("{value} is not a finite number up to {LARGEST_COST:e}")))?;
+    Ok(value)
 }
 
 fn deadline(seconds: f64) -> Result<Duration, ConvertError> {
-    if seconds > 0.0 && seconds <= LONGEST_DEADLINE {
-        return Ok(Duration::from_secs_f64(seconds));
-    }
-    let problem = format!("{seconds} is not a number of seconds above 0 and up to {LONGEST_DEADLINE}");
-    Err(ConvertError::new("deadline_seconds", problem))
+    ConvertError::ensure(seconds > 0.0 && seconds <= LONGEST_DEADLINE, || {
+        let problem = format!("{seconds} is not a number of seconds above 0 and up to {LONGEST_DEADLINE}");
+        ("deadline_seconds", problem)
+    })?;
+    Ok(Duration::from_secs_f64(seconds))
 }
 
 fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Result<(Vec<f32>, usize), ConvertError> {
@@ -220,51 +207,47 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
         }
         None => (positions.coordinates, positions.dims as usize),
     };
-    if !(2..=3).contains(&dims) {
-        return Err(ConvertError::new(format!("{field}.dims"), format!("{dims} is not 2 or 3")));
-    }
-    if values.is_empty() || !values.len().is_multiple_of(dims) {
+    ConvertError::ensure((2..=3).contains(&dims), || (format!("{field}.dims"), format!("{dims} is not 2 or 3")))?;
+    ConvertError::ensure(!values.is_empty() && values.len().is_multiple_of(dims), || {
         let problem = format!("{} numbers do not make points of {dims} coordinates", values.len());
-        return Err(ConvertError::new(format!("{field}.coordinates"), problem));
-    }
-    if values.len() / dims > limits.members {
-        let problem = format!("{} points exceed the limit of {}", values.len() / dims, limits.members);
-        return Err(ConvertError::new(field, problem));
-    }
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(place) => {
-            let path = format!("{field}.coordinates[{place}]");
-            Err(ConvertError::new(path, format!("{} is not finite", values[place])))
-        }
-        None => Ok((values, dims)),
-    }
+        (format!("{field}.coordinates"), problem)
+    })?;
+    let count = values.len() / dims;
+    ConvertError::ensure(count <= limits.members, || {
+        (field, format!("{count} points exceed the limit of {}", limits.members))
+    })?;
+    Ok((arrays::finite(&format!("{field}.coordinates"), values)?, dims))
 }
 
-/// Checks a cost matrix against the number of positions, if there are any.
-fn matrix(
-    costs: v1::CostMatrix,
+/// Checks a cost matrix against the number of positions, if there are any. Returns its shape.
+fn check_matrix(
+    costs: &v1::CostMatrix,
     counts: Option<(usize, usize)>,
     limits: &Limits,
-) -> Result<(Vec<f64>, (usize, usize)), ConvertError> {
-    let shape = (costs.agents as usize, costs.goals as usize);
-    for (field, found, points) in
-        [("costs.agents", shape.0, counts.map(|c| c.0)), ("costs.goals", shape.1, counts.map(|c| c.1))]
-    {
-        if found == 0 || found > limits.members {
-            return Err(ConvertError::new(field, format!("{found} is not in 1..{}", limits.members)));
-        }
+) -> Result<(usize, usize), ConvertError> {
+    let (agents, goals) = (costs.agents as usize, costs.goals as usize);
+    let (agent_points, goal_points) = counts.unzip();
+    for (field, found, points) in [("costs.agents", agents, agent_points), ("costs.goals", goals, goal_points)] {
+        ConvertError::ensure((1..=limits.members).contains(&found), || {
+            (field, format!("{found} is not in 1..{}", limits.members))
+        })?;
         if let Some(points) = points.filter(|&points| points != found) {
             return Err(ConvertError::new(field, format!("{found}, but there are {points} positions")));
         }
     }
-    if costs.values.len() != shape.0 * shape.1 {
-        let problem = format!("{} numbers do not fill {} x {}", costs.values.len(), shape.0, shape.1);
-        return Err(ConvertError::new("costs.values", problem));
-    }
+    ConvertError::ensure(costs.values.len() == agents * goals, || {
+        ("costs.values", format!("{} numbers do not fill {agents} x {goals}", costs.values.len()))
+    })?;
     if let Some(place) = costs.values.iter().position(|value| value.is_nan() || value.abs() > LARGEST_COST) {
         finite_cost(costs.values[place], || format!("costs.values[{place}]"))?;
     }
-    Ok((costs.values, shape))
+    Ok((agents, goals))
+}
+
+/// Checks the length of a member's name.
+pub(crate) fn check_name(id: &str, field: impl FnOnce() -> String) -> Result<(), ConvertError> {
+    let ok = (1..=LONGEST_ID).contains(&id.len());
+    ConvertError::ensure(ok, || (field(), format!("{} bytes; a name has 1 to {LONGEST_ID}", id.len())))
 }
 
 /// Index of every name. There must be as many names as members, or none, and all different.
@@ -273,21 +256,42 @@ fn index<'a>(field: &str, ids: &'a [String], count: usize) -> Result<HashMap<&'a
     if ids.is_empty() {
         return Ok(places);
     }
-    if ids.len() != count {
-        let problem = format!("{} names for {count} members; give one each or none", ids.len());
-        return Err(ConvertError::new(field, problem));
-    }
+    ConvertError::ensure(ids.len() == count, || {
+        (field, format!("{} names for {count} members; give one each or none", ids.len()))
+    })?;
     places.reserve(count);
     for (k, id) in ids.iter().enumerate() {
-        if id.is_empty() || id.len() > LONGEST_ID {
-            let problem = format!("{} bytes; a name has 1 to {LONGEST_ID}", id.len());
-            return Err(ConvertError::new(format!("{field}[{k}]"), problem));
-        }
+        check_name(id, || format!("{field}[{k}]"))?;
         if let Some(first) = places.insert(id.as_str(), k as u32) {
             return Err(ConvertError::new(format!("{field}[{k}]"), format!("the same name as {field}[{first}]")));
         }
     }
     Ok(places)
+}
+
+/// Pairs, each resolved to its members.
+pub(crate) fn pairs<T>(
+    field: &str,
+    pairs: &[v1::PairRef],
+    resolve: impl Fn(&v1::PairRef) -> Result<T, ConvertError>,
+) -> Result<Vec<T>, ConvertError> {
+    let read = |(k, pair)| resolve(pair).map_err(|error| error.within(&format!("{field}[{k}]")));
+    pairs.iter().enumerate().map(read).collect()
+}
+
+/// Pairs with their costs, each resolved to its members.
+pub(crate) fn priced_pairs<T>(
+    field: &str,
+    items: &[v1::PairCost],
+    resolve: impl Fn(&v1::PairRef) -> Result<T, ConvertError>,
+) -> Result<Vec<(T, f64)>, ConvertError> {
+    let read = |(k, item): (usize, &v1::PairCost)| {
+        let path = || format!("{field}[{k}].pair");
+        let pair = item.pair.as_ref().ok_or_else(|| ConvertError::missing(path()))?;
+        let members = resolve(pair).map_err(|error| error.within(&path()))?;
+        Ok((members, finite_cost(item.cost, || format!("{field}[{k}].cost"))?))
+    };
+    items.iter().enumerate().map(read).collect()
 }
 
 /// Names and sizes of both sides.
@@ -309,14 +313,13 @@ impl Sides<'_> {
     }
 }
 
-fn current(pairs: &[v1::PairRef], sides: &Sides<'_>) -> Result<Vec<u32>, ConvertError> {
-    if pairs.is_empty() {
+fn current(current: &[v1::PairRef], sides: &Sides<'_>) -> Result<Vec<u32>, ConvertError> {
+    if current.is_empty() {
         return Ok(Vec::new());
     }
     let mut goal_of = vec![UNASSIGNED; sides.agents.1];
     let mut taken = vec![false; sides.goals.1];
-    for (k, pair) in pairs.iter().enumerate() {
-        let (agent, goal) = sides.resolve(pair).map_err(|e| e.within(&format!("current[{k}]")))?;
+    for (k, (agent, goal)) in pairs("current", current, |pair| sides.resolve(pair))?.into_iter().enumerate() {
         if goal_of[agent as usize] != UNASSIGNED || std::mem::replace(&mut taken[goal as usize], true) {
             return Err(ConvertError::new(format!("current[{k}]"), "its agent or its goal is in another pair too"));
         }

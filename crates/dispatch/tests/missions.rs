@@ -2,18 +2,19 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+use magex_dispatch::answer::Planned;
 use magex_dispatch::disk::{Disk, DiskError};
 use magex_dispatch::engine;
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
+use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::missions::{Bounds, KeepError, Missions};
-use magex_dispatch::{DispatchError, Problem};
+use magex_dispatch::{AssignError, Problem};
 use magex_proto::v1;
 use magex_proto::v1::{ChangeReason, MemberState, UnassignedReason};
 use proptest::prelude::*;
 
 const LIMITS: MissionLimits = MissionLimits { members: 20, lifetime_ms: 60_000 };
 
-fn planner(problem: &Problem) -> Result<Planned, DispatchError> {
+fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     let plan = engine::solve(problem, problem.scheduler, &|| true)?;
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }
@@ -317,7 +318,7 @@ proptest! {
             };
             let next = match mission.update(request, 1, &LIMITS, &planner) {
                 Ok(next) => next,
-                Err(DispatchError::Invalid(error)) => {
+                Err(AssignError::Invalid(error)) => {
                     prop_assert!(error.field.contains('['), "{error}");
                     continue;
                 }

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_dispatch::engine::{self, Plan};
-use magex_dispatch::{DispatchError, Limits, Problem, UNASSIGNED, answer};
+use magex_dispatch::{AssignError, Limits, Problem, UNASSIGNED, answer};
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::{arrays, v1};
 use proptest::prelude::*;
@@ -73,8 +73,8 @@ fn a_matrix_alone_makes_a_team_and_single_costs_and_bans_change_it() {
     for kind in KINDS {
         let response = ask(&banned, kind);
         assert_eq!(response.unassigned_agents, [0]);
-        assert_eq!(response.agents_without_goal[0].reason(), v1::UnassignedReason::Forbidden, "{kind}");
-        assert_eq!(response.goals_without_agent[0].reason(), v1::UnassignedReason::Conflict, "{kind}");
+        assert_eq!(response.agents_without_goal[0].reason(), v1::UnassignedReason::Forbidden, "{kind:?}");
+        assert_eq!(response.goals_without_agent[0].reason(), v1::UnassignedReason::Conflict, "{kind:?}");
         assert_eq!(response.agents_without_goal[0].id, "a0");
     }
 }
@@ -173,7 +173,7 @@ fn planning_stops_when_its_caller_is_gone() {
     let coordinates: Vec<f32> = (0..24).map(|k| ((k * 37) % 23) as f32).collect();
     let problem = read(team(&coordinates, &coordinates[2..]));
     let stopped = engine::solve(&problem, AssignmentMethod::Makespan, &|| false);
-    assert_eq!(stopped, Err(DispatchError::Interrupted));
+    assert_eq!(stopped, Err(AssignError::Interrupted));
     // An answer that is there stays, without its distance to the best.
     let values = (0..144).map(|k| f64::from((k / 12 + 1) * (k % 12 + 1))).collect();
     let costs = Some(v1::CostMatrix { agents: 12, goals: 12, values });

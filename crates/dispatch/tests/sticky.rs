@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+use magex_dispatch::answer::Planned;
 use magex_dispatch::engine::{self, Plan};
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
-use magex_dispatch::{DispatchError, Limits, Problem, UNASSIGNED, answer};
+use magex_dispatch::mission::{Mission, MissionLimits};
+use magex_dispatch::{AssignError, Limits, Problem, UNASSIGNED, answer};
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use magex_proto::v1::ChangeReason;
@@ -65,7 +66,7 @@ fn member(id: &str, x: f32) -> v1::Member {
 }
 
 /// A model that sends agent k to goal k + 1.
-fn restless(problem: &Problem) -> Result<Planned, DispatchError> {
+fn restless(problem: &Problem) -> Result<Planned, AssignError> {
     let (n, g) = (problem.agent_count as u32, problem.goal_count as u32);
     let goals = (0..n).map(|k| (k < g).then_some((k + 1) % g)).collect();
     let plan = engine::adopt(problem, goals, None, &|| true).unwrap();

@@ -2,11 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "helpers of tests")]
 
+use magex_dispatch::answer::Planned;
 use magex_dispatch::disk::{Disk, DiskError, PAUSE};
 use magex_dispatch::engine;
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
+use magex_dispatch::mission::{Mission, MissionLimits};
 use magex_dispatch::missions::{Bounds, KeepError, Missions};
-use magex_dispatch::{DispatchError, Problem};
+use magex_dispatch::{AssignError, Problem};
 use magex_proto::v1;
 use redb::{Database, StorageBackend};
 use std::collections::BTreeMap;
@@ -18,7 +19,7 @@ use std::time::Duration;
 
 const LIMITS: MissionLimits = MissionLimits { members: 100, lifetime_ms: 60_000 };
 
-fn planner(problem: &Problem) -> Result<Planned, DispatchError> {
+fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     let plan = engine::solve(problem, problem.scheduler, &|| true)?;
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }

@@ -8,8 +8,7 @@ pub const FIRST: Duration = Duration::from_millis(100);
 /// Longest wait.
 pub const LONGEST: Duration = Duration::from_secs(5);
 
-/// Jittered exponential backoff: each wait is drawn from the upper half of a span that doubles up to [`LONGEST`].
-/// The jitter reaches no number: it only moves a retry.
+/// Each wait is drawn from the upper half of a span that doubles up to [`LONGEST`]. It reaches no number of a run.
 #[derive(Debug, Clone)]
 pub struct Backoff {
     span: Duration,
@@ -26,18 +25,14 @@ impl Backoff {
     pub fn next_wait(&mut self) -> Duration {
         let span = self.span;
         self.span = (span * 2).min(LONGEST);
-        span / 2 + span.mul_f64(0.5 * fraction())
+        let fraction = f64::from(random_id() as u32) / f64::from(u32::MAX);
+        span / 2 + span.mul_f64(0.5 * fraction)
     }
 
     /// After a success: begin with short waits again.
     pub fn reset(&mut self) {
         *self = Self::default();
     }
-}
-
-/// An unpredictable number in 0..1.
-fn fraction() -> f64 {
-    f64::from(RandomState::new().build_hasher().finish() as u32) / (f64::from(u32::MAX) + 1.0)
 }
 
 /// A random identifier that no other process is likely to draw. It never becomes a number of a run.

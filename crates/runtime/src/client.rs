@@ -1,5 +1,6 @@
 //! Clients of services: channels with TLS and credentials.
 
+use crate::exit::{self, Failure};
 use crate::tls::ClientTls;
 use std::path::Path;
 use std::time::Duration;
@@ -12,60 +13,15 @@ use tonic::{Request, Status};
 /// A channel whose calls carry the client's token, if it has one.
 pub type Channel = InterceptedService<transport::Channel, Bearer>;
 
-/// A URL that cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum UrlError {
-    /// It is malformed.
-    #[error("'{url}' is not an address to connect to ({reason}): use the form http://host:port, or https://host:port")]
-    Form {
-        /// The URL.
-        url: String,
-        /// The problem.
-        reason: String,
-    },
-    /// The token would be sent without TLS.
-    #[error("'{0}': the token would be sent unencrypted to another machine; use https, or --insecure to allow it")]
-    Exposed(String),
-}
-
-/// Why there is no connection.
-#[derive(Debug, thiserror::Error)]
-pub enum ConnectError {
-    /// The URL cannot be used.
-    #[error(transparent)]
-    Url(#[from] UrlError),
-    /// The connection failed.
-    #[error(transparent)]
-    Transport(#[from] transport::Error),
-}
-
-/// A bearer token. Debug output does not show it.
-#[derive(Clone, PartialEq, Eq)]
+/// A bearer token. It is marked as sensitive, so that debug output does not show it.
+#[derive(Debug, Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
-/// Why a token is unusable. The message does not contain it.
-#[derive(Debug, thiserror::Error)]
-pub enum TokenError {
-    /// Its file cannot be read.
-    #[error("the token's file {path}: {source}")]
-    File {
-        /// Its name.
-        path: String,
-        /// The error of the system.
-        source: std::io::Error,
-    },
-    /// Its form.
-    #[error("{0}: a token is one line of printable ASCII")]
-    Form(String),
-}
-
 impl Token {
-    /// A token, without surrounding whitespace; `source` names its origin in errors.
-    ///
-    /// # Errors
-    /// It contains characters that a header cannot carry.
-    pub fn new(text: &str, source: &str) -> Result<Self, TokenError> {
-        let (text, wrong) = (text.trim(), || TokenError::Form(source.to_owned()));
+    /// A token, without surrounding whitespace; `source` names its origin in errors. An error does not contain it.
+    pub fn new(text: &str, source: &str) -> Result<Self, Failure> {
+        let wrong = || Failure::usage(format!("{source}: a token is one line of printable ASCII"));
+        let text = text.trim();
         if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
             return Err(wrong());
         }
@@ -75,25 +31,15 @@ impl Token {
     }
 
     /// Reads a token from a file.
-    ///
-    /// # Errors
-    /// The file cannot be read, or holds no token.
-    pub fn read(path: &Path) -> Result<Self, TokenError> {
-        let name = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|source| TokenError::File { path: name.clone(), source })?;
-        Self::new(&text, &name)
-    }
-}
-
-// A token must not reach a log.
-impl std::fmt::Debug for Token {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Token")
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| Failure::usage(format!("the token's file {}: {error}", path.display())))?;
+        Self::new(&text, &path.display().to_string())
     }
 }
 
 /// The credentials of a client and the CA that it trusts; read once for all connections.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default)]
 pub struct Settings {
     /// For https.
     pub tls: Option<ClientTls>,
@@ -104,32 +50,38 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// A channel that connects with the first call and reconnects after failures.
-    ///
-    /// # Errors
-    /// The URL is malformed, or the token would be sent without TLS.
-    pub fn lazy_channel(&self, url: &str) -> Result<Channel, UrlError> {
+    /// A channel that connects with the first call and reconnects after failures. Fails if the token would be sent without TLS.
+    pub fn lazy_channel(&self, url: &str) -> Result<Channel, Failure> {
         let (endpoint, bearer) = self.endpoint(url)?;
         Ok(InterceptedService::new(endpoint.connect_lazy(), bearer))
     }
 
-    /// A connected channel.
-    ///
-    /// # Errors
-    /// The URL is malformed, the token would be sent without TLS, or the connection failed.
-    pub async fn connect(&self, url: &str) -> Result<Channel, ConnectError> {
+    /// A connected channel. Wrong usage has the exit code of [`Failure::usage`], a failed connection [`exit::UNAVAILABLE`].
+    pub async fn connect(&self, url: &str) -> Result<Channel, Failure> {
         let (endpoint, bearer) = self.endpoint(url)?;
-        Ok(InterceptedService::new(endpoint.connect().await?, bearer))
+        let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
+        Ok(InterceptedService::new(channel, bearer))
     }
 
-    fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), UrlError> {
+    fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), Failure> {
         let endpoint = endpoint_with(url, self.tls.as_ref())?;
         let encrypted = endpoint.uri().scheme_str() == Some("https");
         if self.token.is_some() && !encrypted && !self.insecure && !is_local(endpoint.uri().host()) {
-            return Err(UrlError::Exposed(url.to_owned()));
+            return Err(Failure::usage(format!(
+                "'{url}': the token would be sent unencrypted to another machine; use https, or --insecure to allow it"
+            )));
         }
         Ok((endpoint, Bearer(self.token.clone())))
     }
+}
+
+/// The innermost error: the outer ones of a transport carry no detail.
+pub(crate) fn root_of(error: &dyn std::error::Error) -> String {
+    let mut root = error;
+    while let Some(source) = root.source() {
+        root = source;
+    }
+    root.to_string()
 }
 
 /// Whether a host is this machine: a loopback address, or `localhost`.
@@ -152,36 +104,28 @@ impl Interceptor for Bearer {
 }
 
 /// An endpoint with our settings, without certificates.
-///
-/// # Errors
-/// The URL is malformed.
-pub fn endpoint(url: &str) -> Result<Endpoint, UrlError> {
+pub fn endpoint(url: &str) -> Result<Endpoint, Failure> {
     endpoint_with(url, None)
 }
 
 /// An endpoint that takes the certificates for an https URL from the environment.
-///
-/// # Errors
-/// The URL is malformed, or the certificates cannot be read.
-pub fn endpoint_from_env(url: &str) -> Result<Endpoint, UrlError> {
+pub fn endpoint_from_env(url: &str) -> Result<Endpoint, Failure> {
     let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
-    let tls = secure.then(ClientTls::from_env).transpose();
-    let tls = tls.map_err(|error| UrlError::Form { url: url.to_owned(), reason: error.to_string() })?;
+    let tls = secure.then(ClientTls::from_env).transpose()?;
     endpoint_with(url, tls.as_ref())
 }
 
-/// An endpoint with our settings: a dead peer is detected within 15 s, even on an idle connection. Certificates apply to https
-/// only.
-///
-/// # Errors
-/// The URL is malformed.
-pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, UrlError> {
-    let wrong = |reason: String| UrlError::Form { url: url.to_owned(), reason };
+/// An endpoint that detects a dead peer within 15 s, even on an idle connection. Certificates apply to https only.
+pub fn endpoint_with(url: &str, tls: Option<&ClientTls>) -> Result<Endpoint, Failure> {
+    let wrong = |reason: String| {
+        let form = "use the form http://host:port, or https://host:port";
+        Failure::usage(format!("'{url}' is not an address to connect to ({reason}): {form}"))
+    };
     let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|error| wrong(error.to_string()))?;
     let endpoint = match (endpoint.uri().scheme_str(), tls) {
         _ if endpoint.uri().host().is_none() => return Err(wrong("no host".to_owned())),
         (Some("http"), _) => endpoint,
-        (Some("https"), Some(tls)) => endpoint.tls_config(tls.config()).map_err(|error| wrong(error.to_string()))?,
+        (Some("https"), Some(tls)) => endpoint.tls_config(tls.0.clone()).map_err(|error| wrong(error.to_string()))?,
         (Some("https"), None) => {
             let problem = "name the CA of its certificate: MAGEX_TLS_CA or --tls-ca";
             return Err(wrong(problem.to_owned()));
@@ -219,7 +163,7 @@ mod tests {
         }
         for url in ["http://10.0.0.1:1", "http://learner:1", "http://localhost.evil:1", "http://[2001:db8::1]:1"] {
             let error = settings.endpoint(url).unwrap_err();
-            assert!(matches!(error, UrlError::Exposed(_)), "{error}");
+            assert!(error.message.contains("sent unencrypted"), "{error}");
             Settings { insecure: true, ..settings.clone() }.endpoint(url).unwrap();
             Settings::default().endpoint(url).unwrap();
         }

@@ -1,5 +1,6 @@
 //! Exit codes, as in sysexits.h, and the outcome of a command.
 
+use crate::process::ensure_environment;
 use std::process::ExitCode;
 
 /// Success.
@@ -41,9 +42,12 @@ impl Failure {
     }
 }
 
-/// Runs a command's body with the arguments of this process: usage errors exit with [`USAGE`], failures are printed to
-/// standard error and exit with their code.
+/// Runs the body of a service's command with the arguments of this process, in the environment that it needs: usage errors exit
+/// with [`USAGE`], failures are printed to standard error and exit with their code. `main` calls this before anything else.
 pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> ExitCode {
+    if let Err(error) = ensure_environment() {
+        return report(Err(Failure::new(INTERNAL, error)));
+    }
     let arguments = match P::try_parse() {
         Ok(arguments) => arguments,
         Err(error) => {
@@ -57,7 +61,7 @@ pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> Exit
 
 /// The exit code of a result; a failure is printed to standard error.
 #[allow(clippy::print_stderr, reason = "the one place that prints why a command failed")]
-pub fn report(result: Result<u8, Failure>) -> ExitCode {
+fn report(result: Result<u8, Failure>) -> ExitCode {
     match result {
         Ok(code) => ExitCode::from(code),
         Err(failure) => {

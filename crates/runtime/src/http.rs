@@ -2,9 +2,10 @@
 //!
 //! Read-only and optional: training does not depend on it.
 
+use crate::exit::Failure;
 use crate::metrics::Metrics;
 use crate::net::connections::{ConnectionLimits, Incoming};
-use crate::server::{self, BindError, GRACE};
+use crate::server::{self, GRACE};
 pub use axum::Router;
 use axum::extract::connect_info::Connected;
 use axum::extract::{ConnectInfo, Request};
@@ -35,10 +36,7 @@ pub struct HttpArgs {
 
 impl HttpArgs {
     /// Listens, if an address is given. Must be called within a runtime.
-    ///
-    /// # Errors
-    /// The address is malformed or in use.
-    pub async fn bind(&self) -> Result<Option<Page>, BindError> {
+    pub async fn bind(&self) -> Result<Option<Page>, Failure> {
         match &self.http {
             Some(listen) => bind(listen).await.map(Some),
             None => Ok(None),
@@ -59,8 +57,7 @@ impl Page {
         self.address
     }
 
-    /// Serves in the background until `shutdown`, and at most [`GRACE`] longer. Errors are only logged: training does not
-    /// depend on this server.
+    /// Serves in the background until `shutdown`, and at most [`GRACE`] longer. Errors are only logged.
     pub fn serve(self, routes: Router, shutdown: CancellationToken) -> JoinHandle<()> {
         tokio::spawn(async move {
             if let Err(error) = serve(self.incoming, routes, shutdown).await {
@@ -71,10 +68,7 @@ impl Page {
 }
 
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
-///
-/// # Errors
-/// The address is malformed or in use.
-pub async fn bind(listen: &str) -> Result<Page, BindError> {
+pub async fn bind(listen: &str) -> Result<Page, Failure> {
     let (listener, address) = server::listener(listen, "--http").await?;
     Ok(Page { incoming: Incoming::new(listener, CONNECTIONS), address })
 }

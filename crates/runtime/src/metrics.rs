@@ -7,10 +7,11 @@ mod process;
 
 pub use prometheus::{Gauge, GaugeVec, Histogram, HistogramVec, IntCounter, IntCounterVec};
 
+use crate::sync::lock;
 use prometheus::core::Collector;
 use prometheus::{HistogramOpts, Opts, Registry, TextEncoder};
 use std::fmt;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 /// Upper bounds of the buckets of every duration histogram, seconds.
 const BUCKETS: [f64; 18] =
@@ -80,12 +81,12 @@ impl Metrics {
 
     /// Calls `hook` before every scrape, to set gauges that are computed on demand (ages, lengths of queues).
     pub fn before_scrape(&self, hook: impl Fn() + Send + Sync + 'static) {
-        self.hooks.lock().unwrap_or_else(PoisonError::into_inner).push(Box::new(hook));
+        lock(&self.hooks).push(Box::new(hook));
     }
 
     /// All metrics, in the text format.
     pub fn text(&self) -> String {
-        for hook in self.hooks.lock().unwrap_or_else(PoisonError::into_inner).iter() {
+        for hook in lock(&self.hooks).iter() {
             hook();
         }
         TextEncoder::new().encode_to_string(&self.registry.gather()).unwrap_or_else(|error| format!("# {error}\n"))
@@ -102,8 +103,7 @@ impl Metrics {
     }
 }
 
-/// Raises a counter to `total`, for a total that is counted elsewhere. A smaller `total` changes nothing. Not atomic: callers
-/// hold a lock.
+/// Raises a counter to `total`, which is counted elsewhere and never falls. Not atomic: callers hold a lock.
 pub fn raise_to(counter: &IntCounter, total: u64) {
     counter.inc_by(total.saturating_sub(counter.get()));
 }

@@ -8,16 +8,14 @@
 //!     ▼
 //!  TLS and HTTP/2 (tonic)
 //!     ▼
-//!  Counted              calls and seconds by method and code            [call_metrics]
-//!     ▼
 //!  Guard                from the headers alone                          [guard]
+//!     │   Guarded: calls and seconds are counted by method and code     [call_metrics]
 //!     │   Guarded: authenticate by token or certificate                 [auth]
 //!     │            mark the connection as `Called`: it is no longer evicted
 //!     │   Public:  (health, reflection) the caller is its address; the connection is `Probed`
 //!     │   both:    take a `Permit`: calls or streams of the caller      [in_flight]
+//!     │            `grpc-timeout` becomes a `Deadline`                  [deadline]
 //!     │   body:    the length of every message is counted before the message is read
-//!     ▼
-//!  WithDeadline         `grpc-timeout` becomes a `Deadline`             [deadline]
 //!     ▼
 //!  decoding, then the handler: `auth::caller` checks the role
 //!     │

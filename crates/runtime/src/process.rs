@@ -10,9 +10,8 @@ const ENVIRONMENT: [(&str, &str); 4] = [
     // The tensor library must not start threads of its own.
     ("RAYON_NUM_THREADS", "1"),
     ("CANDLE_NUM_THREADS", "1"),
-    // Blocks of up to 32 MiB come from the heap, and the heap keeps up to 64 MiB free at its end: the upper end of glibc's
-    // dynamic thresholds. With the lower thresholds, each training step returns its buffers to the system and maps them
-    // again, which is three times slower.
+    // The upper end of glibc's dynamic thresholds. With lower ones, each training step returns its buffers to the system and
+    // maps them again, which is three times slower.
     ("MALLOC_MMAP_THRESHOLD_", "33554432"),
     ("MALLOC_TRIM_THRESHOLD_", "67108864"),
 ];
@@ -21,16 +20,15 @@ const ENVIRONMENT: [(&str, &str); 4] = [
 /// 200 actors needs a third less memory and is no slower.
 const ARENAS: &str = "MALLOC_ARENA_MAX";
 
-/// The command that re-executes this process with the missing variables, or `None` if all are set. Variables that are set are
-/// not changed.
-fn in_its_environment() -> std::io::Result<Option<Command>> {
+/// Re-executes this program with the environment that it needs (single-threaded tensor kernels, an allocator that keeps its
+/// buffers), unless all variables are set; those that are set are not changed. `main` calls this before it starts a thread. A
+/// debugger or `strace` sees the `exec`; to avoid it, set the variables. [`log_environment`] logs them once logging is set up.
+pub fn ensure_environment() -> std::io::Result<()> {
     let arenas = processors().to_string();
-    let missing = || {
-        let needed = ENVIRONMENT.into_iter().chain([(ARENAS, arenas.as_str())]);
-        needed.filter(|(name, _)| std::env::var_os(name).is_none())
-    };
-    if missing().next().is_none() {
-        return Ok(None);
+    let needed = ENVIRONMENT.into_iter().chain([(ARENAS, arenas.as_str())]);
+    let mut missing = needed.filter(|(name, _)| std::env::var_os(name).is_none()).peekable();
+    if missing.peek().is_none() {
+        return Ok(());
     }
     let mut command = Command::new(std::env::current_exe()?);
     let mut arguments = std::env::args_os();
@@ -38,18 +36,7 @@ fn in_its_environment() -> std::io::Result<Option<Command>> {
         // The program's behaviour may depend on the name it was called by.
         command.arg0(name);
     }
-    command.args(arguments).envs(missing());
-    Ok(Some(command))
-}
-
-/// Re-executes this program with the environment that it needs (single-threaded tensor kernels, an allocator that keeps its
-/// buffers), unless all variables are set. `main` calls this before it starts a thread. A debugger or `strace` sees the `exec`;
-/// to avoid it, set the variables. [`log_environment`] logs them once logging is set up.
-pub fn ensure_environment() -> std::io::Result<()> {
-    match in_its_environment()? {
-        Some(mut command) => Err(command.exec()),
-        None => Ok(()),
-    }
+    Err(command.args(arguments).envs(missing).exec())
 }
 
 /// Logs, at debug level, the variables for which [`ensure_environment`] re-executes the program.
@@ -62,7 +49,7 @@ pub fn log_environment() {
 
 /// The line that reports to a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`,
 /// with `"http"`, the address of its metrics, as a last key if there is one.
-pub fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) -> String {
+fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) -> String {
     let json = |address: SocketAddr| serde_json::Value::from(address.to_string());
     let http = http.map_or_else(String::new, |http| format!(",\"http\":{}", json(http)));
     // Written out so that the order of the keys is the documented one.

@@ -45,21 +45,6 @@ pub struct ServerArgs {
     pub connections_per_peer: u32,
 }
 
-impl Default for ServerArgs {
-    fn default() -> Self {
-        let most = ConnectionLimits::default();
-        Self {
-            tls_cert: None,
-            tls_key: None,
-            client_ca: None,
-            identities: None,
-            insecure: false,
-            max_connections: most.total as u32,
-            connections_per_peer: most.per_peer as u32,
-        }
-    }
-}
-
 impl ServerArgs {
     /// Limits of the connections.
     pub fn connections(&self) -> ConnectionLimits {
@@ -67,24 +52,14 @@ impl ServerArgs {
         ConnectionLimits { total, per_peer, ..ConnectionLimits::default() }
     }
 
-    /// Reads the files that the options name. A non-loopback address needs TLS and authentication, unless `--insecure` is
-    /// given.
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid, or the address is exposed.
+    /// Reads the files of the options. A non-loopback address needs TLS and authentication, unless `--insecure` is given.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
-        let access = self.identities.as_deref().map(Access::read).transpose().map_err(Failure::usage)?;
-        let tls = match (&self.tls_cert, &self.tls_key) {
-            (Some(certificate), Some(key)) => {
-                Some(ServerTls::read(certificate, key, self.client_ca.as_deref()).map_err(Failure::usage)?)
-            }
-            _ => None,
-        };
-        if let Some(tls) = &tls {
-            server::secure_builder(Some(tls)).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
-        }
+        let access = self.identities.as_deref().map(Access::read).transpose()?;
+        let read = |(certificate, key)| ServerTls::read(certificate, key, self.client_ca.as_deref());
+        let tls = self.own().map(read).transpose()?;
+        server::secure_builder(tls.as_ref()).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
         let security = Security { tls, access: access.unwrap_or_default() };
-        if security.access.needs_certificates() && !security.tls.as_ref().is_some_and(ServerTls::mutual) {
+        if security.access.certificates && !security.tls.as_ref().is_some_and(|tls| tls.mutual) {
             // Without it no client certificate is requested, so those identities could not authenticate.
             return Err(Failure::usage(
                 "--identities: certificate_sha256 needs --client-ca, so that callers present their certificates",
@@ -95,8 +70,8 @@ impl ServerArgs {
     }
 
     fn check_exposure(&self, listen: &str, security: &Security) -> Result<(), Failure> {
-        let address = server::resolve(listen).map_err(Failure::usage)?;
-        let known = security.access.restricted() || security.tls.as_ref().is_some_and(ServerTls::mutual);
+        let address = server::resolve(listen)?;
+        let known = security.access.restricted() || security.tls.as_ref().is_some_and(|tls| tls.mutual);
         if address.ip().is_loopback() || self.insecure || (security.tls.is_some() && known) {
             return Ok(());
         }
@@ -130,19 +105,14 @@ pub struct ClientArgs {
 impl ClientArgs {
     /// Reads the files that the options name, or the token of the environment without a token file. `own` are the client's
     /// certificate and key; `insecure` allows sending a token without TLS.
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid.
     pub fn read(&self, own: Option<(&Path, &Path)>, insecure: bool) -> Result<Settings, Failure> {
-        let tls = match &self.tls_ca {
-            Some(ca) => Some(ClientTls::read(ca, own.map(|own| own.0), own.map(|own| own.1)).map_err(Failure::usage)?),
-            None => None,
-        };
+        let (certificate, key) = own.unzip();
+        let tls = self.tls_ca.as_deref().map(|ca| ClientTls::read(ca, certificate, key)).transpose()?;
         let token = match &self.token_file {
             Some(path) => Some(Token::read(path)),
             None => std::env::var_os("MAGEX_TOKEN").map(|text| Token::new(&text.to_string_lossy(), "MAGEX_TOKEN")),
         };
-        Ok(Settings { tls, token: token.transpose().map_err(Failure::usage)?, insecure })
+        Ok(Settings { tls, token: token.transpose()?, insecure })
     }
 }
 
@@ -166,9 +136,6 @@ pub struct CallerArgs {
 
 impl CallerArgs {
     /// As [`ClientArgs::read`].
-    ///
-    /// # Errors
-    /// Wrong usage: a file is invalid.
     pub fn read(&self) -> Result<Settings, Failure> {
         self.client.read(self.tls_cert.as_deref().zip(self.tls_key.as_deref()), self.insecure)
     }
@@ -178,6 +145,17 @@ impl CallerArgs {
 mod tests {
     use super::*;
     use crate::exit::USAGE;
+    use clap::Parser as _;
+
+    #[derive(clap::Parser)]
+    struct Command {
+        #[command(flatten)]
+        args: ServerArgs,
+    }
+
+    fn defaults() -> ServerArgs {
+        Command::parse_from(["test"]).args
+    }
 
     #[test]
     fn an_exposed_address_needs_certificates_and_identities() {
@@ -185,7 +163,7 @@ mod tests {
         let path = folder.path().join("identities.toml");
         let hash = "a".repeat(64);
         std::fs::write(&path, format!("[[identity]]\nname = 'a'\nrole = 'admin'\ntoken_sha256 = '{hash}'")).unwrap();
-        let open = ServerArgs::default();
+        let open = defaults();
         let known = ServerArgs { identities: Some(path), ..open.clone() };
         open.read("127.0.0.1:0").unwrap();
         open.read("[::1]:0").unwrap();
@@ -204,7 +182,7 @@ mod tests {
         let hash = "a".repeat(64);
         std::fs::write(&path, format!("[[identity]]\nname = 'a'\nrole = 'admin'\ncertificate_sha256 = '{hash}'"))
             .unwrap();
-        let failure = ServerArgs { identities: Some(path), ..ServerArgs::default() }.read("127.0.0.1:0").unwrap_err();
+        let failure = ServerArgs { identities: Some(path), ..defaults() }.read("127.0.0.1:0").unwrap_err();
         assert!(failure.code == USAGE && failure.message.contains("--client-ca"), "{failure}");
     }
 

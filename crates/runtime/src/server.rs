@@ -1,9 +1,10 @@
 //! Listening and serving.
 
+use crate::exit::{self, Failure};
 pub use crate::net::connections::Incoming;
 use crate::net::connections::{ConnectionLimits, Connections};
 use crate::net::guard::Guard;
-use crate::tls::{ServerTls, TlsError};
+use crate::tls::{ServerTls, unusable};
 use std::future::Future;
 use std::io::{Error, ErrorKind};
 use std::net::{SocketAddr, ToSocketAddrs as _};
@@ -21,60 +22,28 @@ pub const GRACE: Duration = Duration::from_secs(3);
 /// The option with a service's address.
 const LISTEN: &str = "--listen";
 
-/// Why a service cannot listen.
-#[derive(Debug, thiserror::Error)]
-pub enum BindError {
-    /// The address is malformed.
-    #[error("'{address}' is not an address to listen on: use the form host:port, for example {option} 127.0.0.1:7000")]
-    Address {
-        /// The address given.
-        address: String,
-        /// The option that sets it.
-        option: &'static str,
-    },
-    /// Another process listens there.
-    #[error("port {port} is in use ({address}): choose another with {option}, or port 0 for any free one")]
-    InUse {
-        /// The option that sets it.
-        option: &'static str,
-        /// The address.
-        address: String,
-        /// Its port.
-        port: u16,
-    },
-    /// Another error of the system.
-    #[error("cannot listen on {address}: {source}; choose another with {option}")]
-    Other {
-        /// The option that sets it.
-        option: &'static str,
-        /// The address.
-        address: String,
-        /// The error of the system.
-        source: Error,
-    },
-}
-
 /// Listens on `host:port`; port 0 is any free one. Must be called within a runtime.
-pub async fn bind(listen: &str) -> Result<(Incoming, SocketAddr), BindError> {
+pub async fn bind(listen: &str) -> Result<(Incoming, SocketAddr), Failure> {
     let (listener, local) = listener(listen, LISTEN).await?;
-    Ok((incoming(listener), local))
+    Ok((Incoming::new(listener, ConnectionLimits::default()), local))
 }
 
 /// Listens on the address that an option gave.
-pub(crate) async fn listener(listen: &str, option: &'static str) -> Result<(TcpListener, SocketAddr), BindError> {
-    let wanted = resolve_for(listen, option)?;
-    let failed = |source: Error| match source.kind() {
-        ErrorKind::AddrInUse => BindError::InUse { option, address: listen.to_owned(), port: wanted.port() },
-        _ => BindError::Other { option, address: listen.to_owned(), source },
+pub(crate) async fn listener(listen: &str, option: &str) -> Result<(TcpListener, SocketAddr), Failure> {
+    let unavailable = |problem: String| Failure::new(exit::UNAVAILABLE, problem);
+    let wanted = resolve_for(listen, option).map_err(unavailable)?;
+    let failed = |error: Error| {
+        unavailable(match error.kind() {
+            ErrorKind::AddrInUse => {
+                let port = wanted.port();
+                format!("port {port} is in use ({listen}): choose another with {option}, or port 0 for any free one")
+            }
+            _ => format!("cannot listen on {listen}: {error}; choose another with {option}"),
+        })
     };
     let listener = TcpListener::bind(wanted).await.map_err(failed)?;
     let local = listener.local_addr().map_err(failed)?;
     Ok((listener, local))
-}
-
-/// The connections of a listener, within the usual limits.
-pub fn incoming(listener: TcpListener) -> Incoming {
-    Incoming::new(listener, ConnectionLimits::default())
 }
 
 /// A server with our settings: silent peers are detected within 15 s, and the streams of a connection are limited.
@@ -89,27 +58,24 @@ pub fn builder() -> Server {
 }
 
 /// [`builder`], with TLS if there are certificates.
-///
-/// # Errors
-/// The certificates are invalid.
-pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, TlsError> {
+pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, Failure> {
     match tls {
-        Some(tls) => builder().tls_config(tls.config()).map_err(|error| TlsError::Unusable(error.to_string())),
+        Some(tls) => builder().tls_config(tls.config.clone()).map_err(unusable),
         None => Ok(builder()),
     }
 }
 
 /// Resolves `host:port`.
-///
-/// # Errors
-/// The address is malformed or unknown.
-pub fn resolve(listen: &str) -> Result<SocketAddr, BindError> {
-    resolve_for(listen, LISTEN)
+pub fn resolve(listen: &str) -> Result<SocketAddr, Failure> {
+    resolve_for(listen, LISTEN).map_err(Failure::usage)
 }
 
-fn resolve_for(listen: &str, option: &'static str) -> Result<SocketAddr, BindError> {
-    let wrong = || BindError::Address { address: listen.to_owned(), option };
-    listen.to_socket_addrs().map_err(|_| wrong())?.next().ok_or_else(wrong)
+fn resolve_for(listen: &str, option: &str) -> Result<SocketAddr, String> {
+    listen.to_socket_addrs().ok().and_then(|mut addresses| addresses.next()).ok_or_else(|| {
+        format!(
+            "'{listen}' is not an address to listen on: use the form host:port, for example {option} 127.0.0.1:7000"
+        )
+    })
 }
 
 /// Serves until `shutdown`, then stops accepting, waits at most `grace` for open calls, and drops the rest.
@@ -142,9 +108,6 @@ pub(crate) async fn within<T>(
 }
 
 /// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set and for health.
-///
-/// # Errors
-/// The descriptors cannot be decoded.
 pub fn with_reflection(
     router: Router,
     descriptors: &'static [u8],

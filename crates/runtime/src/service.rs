@@ -4,7 +4,7 @@
 use crate::exit::{self, Failure};
 use crate::http::{HttpArgs, Page, Router};
 use crate::net::connections::ConnectionLimits;
-use crate::server::{self, BindError, Incoming};
+use crate::server::{self, Incoming};
 use crate::telemetry::{self, LogFormat, TraceArgs};
 use crate::{process, shutdown};
 use clap::Args;
@@ -50,11 +50,8 @@ pub struct Context {
 
 impl Context {
     /// Binds the service's address.
-    ///
-    /// # Errors
-    /// The address is malformed or in use.
     pub async fn listen(&mut self, listen: &str, limits: ConnectionLimits) -> Result<(Incoming, SocketAddr), Failure> {
-        let (incoming, address) = server::bind(listen).await.map_err(unavailable)?;
+        let (incoming, address) = server::bind(listen).await?;
         self.address = Some(address);
         Ok((incoming.within(limits), address))
     }
@@ -71,11 +68,7 @@ impl Context {
     }
 }
 
-/// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines; traces have it with the
-/// prefix `magex-`.
-///
-/// # Errors
-/// Wrong usage, a socket that cannot be bound, and what `run` returns.
+/// Runs a service on `threads` network threads until `run` returns. `name` is its name in ready lines and traces.
 pub fn main<T>(
     name: &'static str,
     threads: usize,
@@ -93,20 +86,16 @@ pub fn main<T>(
         .map_err(internal)?;
     let telemetry = {
         let _runtime = runtime.enter();
-        telemetry::init(&format!("magex-{name}"), args.log_format, &args.traces).map_err(Failure::usage)?
+        telemetry::init(&format!("magex-{name}"), args.log_format, &args.traces)?
     };
     process::log_environment();
     let result = runtime.block_on(async {
         let stop = shutdown::on_signal().map_err(internal)?;
-        let page = args.http.bind().await.map_err(unavailable)?;
+        let page = args.http.bind().await?;
         run(Context { stop, name, address: None, page }).await
     });
     telemetry.flush();
     // A thread that still works must not delay the end.
     runtime.shutdown_background();
     result
-}
-
-fn unavailable(error: BindError) -> Failure {
-    Failure::new(exit::UNAVAILABLE, error)
 }

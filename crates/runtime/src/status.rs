@@ -31,8 +31,7 @@ pub fn retry_delay(status: &Status) -> Option<Duration> {
     status.get_details_retry_info().and_then(|info| info.retry_delay)
 }
 
-/// Whether a retry may succeed. This includes every status that tonic made of a broken connection (it has a source) and damaged
-/// messages.
+/// Whether a retry may succeed, also after a broken connection (tonic's status has a source) or a damaged message.
 pub fn is_transient(status: &Status) -> bool {
     let own = std::error::Error::source(status).is_some();
     own || matches!(

@@ -1,6 +1,7 @@
 //! Logs on standard error, and traces to a collector when asked for.
 
-use crate::client::{self, UrlError};
+use crate::client;
+use crate::exit::Failure;
 use crate::trace;
 use opentelemetry::KeyValue;
 use opentelemetry::trace::TracerProvider as _;
@@ -45,17 +46,6 @@ pub struct TraceArgs {
     pub otlp: Option<String>,
 }
 
-/// Why telemetry cannot be set up.
-#[derive(Debug, thiserror::Error)]
-pub enum TelemetryError {
-    /// The collector's address.
-    #[error("--otlp: {0}")]
-    Url(#[from] UrlError),
-    /// The exporter.
-    #[error("--otlp: traces cannot be exported: {0}")]
-    Exporter(#[from] opentelemetry_otlp::ExporterBuildError),
-}
-
 /// The exporter of traces, to be flushed when the process ends.
 #[derive(Debug)]
 #[must_use = "queued spans are lost without a flush"]
@@ -76,10 +66,8 @@ impl Telemetry {
 
 /// Sends logs to standard error, and the spans of [`trace::TARGET`] to a collector if there is one. `RUST_LOG` sets what is
 /// logged, `info` without it. A second call changes nothing. Must be called within a runtime, which the exporter uses.
-///
-/// # Errors
-/// The collector's address is malformed. A collector that does not answer is no error: spans are dropped.
-pub fn init(service: &str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, TelemetryError> {
+/// A collector that does not answer is no error: spans are dropped.
+pub fn init(service: &str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, Failure> {
     let traces = args.otlp.as_deref().map(|url| provider(service, url)).transpose()?;
     let spans = traces.as_ref().map(|traces| {
         tracing_opentelemetry::layer()
@@ -109,12 +97,14 @@ fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat) -> impl Layer
     lines.with_filter(filter.and(filter_fn(|metadata| !is_traced(metadata))))
 }
 
-fn provider(service: &str, url: &str) -> Result<SdkTracerProvider, TelemetryError> {
+fn provider(service: &str, url: &str) -> Result<SdkTracerProvider, Failure> {
+    let endpoint = client::endpoint_from_env(url).map_err(|error| Failure::usage(format!("--otlp: {error}")))?;
     let exporter = opentelemetry_otlp::SpanExporter::builder()
         .with_tonic()
-        .with_channel(client::endpoint_from_env(url)?.connect_lazy())
+        .with_channel(endpoint.connect_lazy())
         .with_timeout(EXPORT)
-        .build()?;
+        .build()
+        .map_err(|error| Failure::usage(format!("--otlp: traces cannot be exported: {error}")))?;
     let exporter = LoggedExporter { exporter, unreachable: AtomicBool::new(false) };
     // A dedicated thread sends; creating a span never waits.
     let batches = BatchConfigBuilder::default().with_max_queue_size(WAITING).with_scheduled_delay(DELAY).build();
@@ -140,14 +130,6 @@ impl SpanExporter for LoggedExporter {
             _ => {}
         }
         result
-    }
-
-    fn shutdown_with_timeout(&self, timeout: Duration) -> OTelSdkResult {
-        self.exporter.shutdown_with_timeout(timeout)
-    }
-
-    fn force_flush(&self) -> OTelSdkResult {
-        self.exporter.force_flush()
     }
 
     fn set_resource(&mut self, resource: &Resource) {

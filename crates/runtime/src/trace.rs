@@ -1,7 +1,6 @@
 //! Traces across processes: spans and their propagation.
 //!
-//! Spans of a trace have [`TARGET`] as their target. Unless traces are exported (see `telemetry`) a span costs one comparison.
-//! A trace reaches no number of a run.
+//! Spans of a trace have [`TARGET`] as their target; unless traces are exported, a span costs one comparison.
 
 use opentelemetry::propagation::TextMapPropagator as _;
 use opentelemetry_sdk::propagation::TraceContextPropagator;

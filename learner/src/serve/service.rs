@@ -10,16 +10,15 @@ use crate::serve::validate::Limits;
 use crate::serve::weights_board;
 use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer};
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_MESSAGE_BYTES, v1};
+use magex_runtime::exit::Failure;
 use magex_runtime::health::Health;
 use magex_runtime::http::{self, Router};
 use magex_runtime::net::auth::{Role, caller};
-use magex_runtime::net::deadline::WithDeadline;
 use magex_runtime::net::guard::{Guard, Rules};
 use magex_runtime::net::in_flight::{InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
 use magex_runtime::status;
-use magex_runtime::tls::TlsError;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -61,7 +60,7 @@ pub struct LearnerHandle {
 pub enum ServeError {
     /// The certificates are invalid.
     #[error("tls: {0}")]
-    Tls(#[from] TlsError),
+    Tls(#[from] Failure),
     /// The server failed.
     #[error("the learner's server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
@@ -90,10 +89,11 @@ impl LearnerHandle {
             in_flight: InFlight::new(IN_FLIGHT, CancellationToken::new()),
             streams: STREAMS,
             message_bytes: MAX_MESSAGE_BYTES,
+            calls: None,
         };
         let router = server::secure_builder(self.security.tls.as_ref())?
             .add_service(Guard::public(health_service, connections.clone()))
-            .add_service(Guard::guarded(WithDeadline::new(service), rules, connections.clone()));
+            .add_service(Guard::guarded(service, rules, connections.clone()));
         let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
         let shared = self.shared.clone();
         let stopped = shutdown.clone();

@@ -1,13 +1,14 @@
 //! Requests and missions, up to the answer.
 
-use magex_dispatch::mission::{Mission, MissionLimits, Planned};
-use magex_dispatch::{DispatchError, Limits, Problem, answer, engine};
+use magex_dispatch::answer::Planned;
+use magex_dispatch::mission::{Mission, MissionLimits};
+use magex_dispatch::{AssignError, Limits, Problem, answer, engine};
 use magex_proto::v1::{AssignRequest, AssignResponse, CreateMissionRequest, UpdateMissionRequest};
 use prost::Message as _;
 
 const LIMITS: MissionLimits = MissionLimits { members: 16, lifetime_ms: 1000 };
 
-fn planner(problem: &Problem) -> Result<Planned, DispatchError> {
+fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     let plan = engine::solve(problem, problem.scheduler, &|| true)?;
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }
@@ -77,10 +78,10 @@ fn check_mission(mission: &Mission) {
     }
 }
 
-fn check_refusal(error: &DispatchError) {
+fn check_refusal(error: &AssignError) {
     match error {
-        DispatchError::Invalid(error) => assert!(!error.field.is_empty() && !error.problem.is_empty()),
-        DispatchError::Interrupted => panic!("it was not interrupted"),
+        AssignError::Invalid(error) => assert!(!error.field.is_empty() && !error.problem.is_empty()),
+        AssignError::Interrupted => panic!("it was not interrupted"),
     }
 }
 

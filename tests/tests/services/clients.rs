@@ -1,7 +1,7 @@
 //! Outside clients: one team, many, streams; what stands in for what, and what a stop looks like to them.
 
 use crate::sandbox::*;
-use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply};
 use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
 use magex_proto::v1;
@@ -155,7 +155,7 @@ impl Scheduler for SlowScheduler {
         Err(SchedulerError::Unsupported("not for actors".into()))
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, request: &magex_dispatch::Problem) -> Result<TeamReply, SchedulerError> {
         self.0.pass();
         let goals = (0..request.agent_count as u32).map(Some).collect();
         Ok(TeamReply { goals, probabilities: None })
@@ -181,7 +181,7 @@ impl Scheduler for BrokenScheduler {
         panic!("broken")
     }
 
-    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, _: &magex_dispatch::Problem) -> Result<TeamReply, SchedulerError> {
         panic!("broken")
     }
 }

@@ -6,7 +6,7 @@ use crate::floods::{healthy, post};
 use crate::sandbox::*;
 use crate::security::{all_roles, commander_as, guarded};
 use magex_commander::scheduler::{
-    AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest, WeightsKey,
+    AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, WeightsKey,
 };
 use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
@@ -195,7 +195,7 @@ impl Scheduler for Classical {
         AssignmentMethod::Exact
     }
 
-    fn assign_team(&self, _: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, _: &magex_dispatch::Problem) -> Result<TeamReply, SchedulerError> {
         Err(SchedulerError::Unsupported("the run has no learned commander".into()))
     }
 }

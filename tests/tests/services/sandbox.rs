@@ -4,7 +4,7 @@ use bytes::Bytes;
 use magex_actor::goal_client::{GoalRequest, GoalSource};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
-use magex_commander::scheduler::{GoalReply, LoadScheduler, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::scheduler::{GoalReply, LoadScheduler, Scheduler, SchedulerError, TeamReply};
 use magex_commander::service::ServiceConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::METRICS;
@@ -379,7 +379,7 @@ impl Scheduler for FakeScheduler {
         Ok(GoalReply { goals, log_probs: vec![-1.0; b], costs: vec![2.0; b], exact_costs: vec![1.0; b] })
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, request: &magex_dispatch::Problem) -> Result<TeamReply, SchedulerError> {
         if request.agent_count != request.goal_count {
             return Err(SchedulerError::Unsupported("as many goals as agents are needed".into()));
         }

@@ -2,7 +2,7 @@
 
 use crate::clients::positions;
 use crate::sandbox::*;
-use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply, TeamRequest};
+use magex_commander::scheduler::{GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply};
 use magex_commander::service::ServiceConfig;
 use magex_commander::weights_file::WeightsFile;
 use magex_learner::collector::Collector as _;
@@ -19,7 +19,7 @@ impl Scheduler for Numbered {
         Err(SchedulerError::Unsupported("not for actors".into()))
     }
 
-    fn assign_team(&self, request: &TeamRequest) -> Result<TeamReply, SchedulerError> {
+    fn assign_team(&self, request: &magex_dispatch::Problem) -> Result<TeamReply, SchedulerError> {
         let n = request.agent_count as u32;
         // The version is read again and again: a torn one would show.
         let goals = (0..n).map(|agent| Some((agent + self.0) % n)).collect();

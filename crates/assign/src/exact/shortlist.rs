@@ -43,8 +43,7 @@ impl Shortlists {
         self.lists.resize(rows, Shortlist::default());
     }
 
-    /// Shortens the paths through a row to the columns on its list, if it has one; no path through it to another column is
-    /// shorter than what is returned.
+    /// Shortens the paths through a row to its list, if it has one; no path to another column is shorter than the result.
     pub(super) fn relax(&self, row: u32, open_price: &[f64], offset: f64, distance: &mut [f64]) -> Option<f64> {
         let list = &self.lists[row as usize];
         if list.entries.is_empty() {

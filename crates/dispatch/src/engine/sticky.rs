@@ -1,9 +1,7 @@
-//! Switching costs: current pairs are made cheaper, and a preferred matching that ignores them is followed only where it saves
-//! more than the switches cost.
+//! Switching costs: current pairs are cheaper, and a preferred matching is followed only where it saves more than they cost.
 
-use super::pairs;
 use crate::UNASSIGNED;
-use magex_assign::{AssignError, Solver};
+use magex_assign::{AssignError, Solver, pairs};
 
 /// Minimum gain of leaving a pair, relative to its own cost: more than the rounding of sums.
 const WORTH: f64 = 1e-9;
@@ -33,10 +31,9 @@ fn smallest(costs: &[f64]) -> Option<f64> {
 
 /// Follows `wish`, a maximum matching, only where it saves more than leaving the current pairs costs.
 ///
-/// The alternative keeps all current pairs that are still allowed, gives the other agents their goal in `wish` if it is free, and
-/// assigns the rest with the exact solver. The two matchings differ in groups that share no agent and no goal: an exchange, or a
-/// chain of agents that each take the next one's goal. Every group is decided separately, by the `adjusted` costs. The matching
-/// with more pairs always wins.
+/// The alternative keeps all current pairs that are still allowed, gives the other agents their goal in `wish` if it is free,
+/// and assigns the rest exactly. The two matchings differ in groups that share no agent and no goal: an exchange, or a chain of
+/// agents that each take the next one's goal. Every group is decided by its `adjusted` costs; more pairs always win.
 pub(super) fn follow(
     wish: &[u32],
     adjusted: &[f64],

@@ -14,16 +14,14 @@ pub(super) fn sentence(
         (from.unwrap_or_default(), to.map_or_else(|| "it has no goal now".into(), |to| format!("it gets {to}")));
     match reason {
         v1::ChangeReason::Assigned => format!("{agent} had no goal and gets {}", to.unwrap_or_default()),
-        v1::ChangeReason::Switched => match saving {
-            Some(saving) => format!(
-                "{agent} switches from {from} to {}: the team saves {saving:.4}, more than the switching cost of {switching_cost} per agent",
-                to.unwrap_or_default()
-            ),
-            None => format!(
-                "{agent} switches from {from} to {}: the changed team saves more than the switching cost of {switching_cost} per agent",
-                to.unwrap_or_default()
-            ),
-        },
+        v1::ChangeReason::Switched => {
+            let saves = saving.map_or_else(
+                || "the changed team saves more than".to_owned(),
+                |saving| format!("the team saves {saving:.4}, more than"),
+            );
+            let to = to.unwrap_or_default();
+            format!("{agent} switches from {from} to {to}: {saves} the switching cost of {switching_cost} per agent")
+        }
         v1::ChangeReason::AgentFailed => format!("{agent} failed and loses {from}"),
         v1::ChangeReason::AgentFinished => format!("{agent} finished and loses {from}"),
         v1::ChangeReason::AgentRemoved => format!("{agent} was removed and loses {from}"),

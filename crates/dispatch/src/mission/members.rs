@@ -1,11 +1,10 @@
 //! Checks the members and settings of a mission in requests and records.
 
 use super::{MissionLimits, Names, TRAINING_PREFIX};
-use crate::DispatchError;
-use crate::problem::{LONGEST_ID, finite_cost, scheduler, switching_cost};
+use crate::problem::{LONGEST_ID, check_name, finite_cost, scheduler, switching_cost};
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
-use magex_proto::v1;
+use magex_proto::{arrays, v1};
 use std::collections::{BTreeSet, HashMap, HashSet};
 
 /// Maximum number of forbidden pairs, of cost overrides, and of entries of a list in a request.
@@ -14,15 +13,14 @@ pub(super) fn most_pairs(limits: &MissionLimits) -> usize {
 }
 
 /// Rejects oversized lists before they are processed.
-pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), DispatchError> {
+pub(super) fn check_lengths(limits: &MissionLimits, lists: &[(&str, usize)]) -> Result<(), ConvertError> {
     let most = most_pairs(limits);
-    match lists.iter().find(|(_, count)| *count > most) {
-        Some((field, count)) => Err(DispatchError::invalid(
-            *field,
-            format!("{count} entries exceed the limit of {most}; send fewer at a time"),
-        )),
-        None => Ok(()),
+    for &(field, count) in lists {
+        ConvertError::ensure(count <= most, || {
+            (field, format!("{count} entries exceed the limit of {most}; send fewer at a time"))
+        })?;
     }
+    Ok(())
 }
 
 /// The names of a mission's members.
@@ -39,15 +37,13 @@ impl<'a> MemberNames<'a> {
 
     /// Resolves a pair by name: indices change when members are removed.
     pub(super) fn names(&self, pair: &v1::PairRef) -> Result<Names, ConvertError> {
-        let known = |field: &str, members: &HashSet<&str>, id: &str| match members.contains(id) {
-            true => Ok(()),
-            false if id.is_empty() => {
-                Err(ConvertError::new(field, "missing; pairs of a mission are named by id, not by index"))
-            }
-            false => Err(ConvertError::new(field, "no member has this name")),
-        };
-        known("agent_id", &self.agents, &pair.agent_id)?;
-        known("goal_id", &self.goals, &pair.goal_id)?;
+        let sides = [("agent_id", &self.agents, &pair.agent_id), ("goal_id", &self.goals, &pair.goal_id)];
+        for (field, members, id) in sides {
+            ConvertError::ensure(!id.is_empty(), || {
+                (field, "missing; pairs of a mission are named by id, not by index")
+            })?;
+            ConvertError::ensure(members.contains(id.as_str()), || (field, "no member has this name"))?;
+        }
         Ok((pair.agent_id.clone(), pair.goal_id.clone()))
     }
 }
@@ -59,93 +55,82 @@ pub(super) fn merge(
     updates: Vec<v1::Member>,
     dims: usize,
     limits: &MissionLimits,
-) -> Result<(), DispatchError> {
+) -> Result<(), ConvertError> {
     let mut places: HashMap<String, usize> = members.iter().enumerate().map(|(k, m)| (m.id.clone(), k)).collect();
     let mut seen = BTreeSet::new();
     for (k, update) in updates.into_iter().enumerate() {
-        let wrong = |part: &str, problem: String| Err(DispatchError::invalid(format!("{field}[{k}].{part}"), problem));
-        if update.id.is_empty() || update.id.len() > LONGEST_ID {
-            return wrong("id", format!("{} bytes; a name has 1 to {LONGEST_ID}", update.id.len()));
-        }
-        if !seen.insert(update.id.clone()) {
-            return wrong("id", "duplicate name".to_owned());
-        }
-        let Ok(state) = v1::MemberState::try_from(update.state) else {
-            return wrong("state", format!("{} is not a state; use active, failed or finished", update.state));
-        };
-        if let Some(axis) = update.position.iter().position(|x| !x.is_finite()) {
-            return wrong(&format!("position[{axis}]"), format!("{} is not finite", update.position[axis]));
-        }
-        let known = places.get(&update.id).copied();
-        if !(known.is_some() && update.position.is_empty()) {
-            if !(2..=3).contains(&update.position.len()) {
-                return wrong("position", format!("{} coordinates; give 2 or 3", update.position.len()));
-            }
-            if update.position.len() != dims {
-                return wrong(
-                    "position",
-                    format!("{} coordinates, but other members have {dims}", update.position.len()),
-                );
-            }
+        let path = |part: &str| format!("{field}[{k}].{part}");
+        check_name(&update.id, || path("id"))?;
+        ConvertError::ensure(seen.insert(update.id.clone()), || (path("id"), "duplicate name"))?;
+        let state = v1::MemberState::try_from(update.state).map_err(|_| {
+            let problem = format!("{} is not a state; use active, failed or finished", update.state);
+            ConvertError::new(path("state"), problem)
+        })?;
+        let position = arrays::finite(&path("position"), update.position)?;
+        let (known, count) = (places.get(&update.id).copied(), position.len());
+        if known.is_none() || count > 0 {
+            ConvertError::ensure((2..=3).contains(&count), || {
+                (path("position"), format!("{count} coordinates; give 2 or 3"))
+            })?;
+            ConvertError::ensure(count == dims, || {
+                (path("position"), format!("{count} coordinates, but other members have {dims}"))
+            })?;
         }
         match known {
             Some(place) => {
                 let member = &mut members[place];
-                if !update.position.is_empty() {
-                    member.position = update.position;
+                if count > 0 {
+                    member.position = position;
                 }
                 if state != v1::MemberState::Unspecified {
                     member.state = state.into();
                 }
             }
             None => {
-                if members.len() >= limits.members {
-                    return wrong("id", format!("a mission has at most {} {field}", limits.members));
-                }
+                let most = limits.members;
+                ConvertError::ensure(members.len() < most, || {
+                    (path("id"), format!("a mission has at most {most} {field}"))
+                })?;
                 let state = if state == v1::MemberState::Unspecified { v1::MemberState::Active } else { state };
                 places.insert(update.id.clone(), members.len());
-                members.push(v1::Member { state: state.into(), ..update });
+                members.push(v1::Member { id: update.id, position, state: state.into() });
             }
         }
     }
     Ok(())
 }
 
-pub(super) fn sticky_scheduler(value: i32) -> Result<Option<AssignmentMethod>, DispatchError> {
-    let kind = scheduler("scheduler", value)?;
-    if kind == Some(AssignmentMethod::Random) {
-        return Err(DispatchError::invalid(
-            "scheduler",
-            "random is not allowed for a mission; use exact, makespan, greedy or learned",
-        ));
-    }
+pub(super) fn sticky_scheduler(value: i32) -> Result<Option<AssignmentMethod>, ConvertError> {
+    let kind = scheduler(value)?;
+    ConvertError::ensure(kind != Some(AssignmentMethod::Random), || {
+        ("scheduler", "random is not allowed for a mission; use exact, makespan, greedy or learned")
+    })?;
     Ok(kind)
 }
 
-pub(super) fn check_id(id: &str) -> Result<(), DispatchError> {
+pub(super) fn check_id(id: &str) -> Result<(), ConvertError> {
     let fits = id.len() <= LONGEST_ID && id.bytes().all(|b| b.is_ascii_alphanumeric() || b"._-".contains(&b));
-    if fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX) {
-        return Ok(());
-    }
-    let problem =
-        format!("use 1 to {LONGEST_ID} characters of A-Z a-z 0-9 . _ -, not starting with '{TRAINING_PREFIX}'");
-    Err(DispatchError::invalid("mission_id", problem))
+    ConvertError::ensure(fits && !id.is_empty() && !id.starts_with(TRAINING_PREFIX), || {
+        let form =
+            format!("use 1 to {LONGEST_ID} characters of A-Z a-z 0-9 . _ -, not starting with '{TRAINING_PREFIX}'");
+        ("mission_id", form)
+    })
 }
 
-pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, DispatchError> {
+pub(super) fn lifetime(seconds: Option<f64>, limits: &MissionLimits) -> Result<i64, ConvertError> {
     let Some(seconds) = seconds else { return Ok(limits.lifetime_ms) };
     let most = limits.lifetime_ms as f64 / 1e3;
-    if seconds > 0.0 && seconds <= most {
-        return Ok(((seconds * 1e3) as i64).max(1));
-    }
-    Err(DispatchError::invalid("lifetime_seconds", format!("{seconds} is outside 0..={most}; give a positive number")))
+    ConvertError::ensure(seconds > 0.0 && seconds <= most, || {
+        ("lifetime_seconds", format!("{seconds} is outside 0..={most}; give a positive number"))
+    })?;
+    Ok(((seconds * 1e3) as i64).max(1))
 }
 
 /// Checks a record by the rules of requests, on which updates rely.
 pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Result<(), ConvertError> {
     let wrong = |field: String, problem: &str| Err(ConvertError::new(field, problem.to_owned()));
-    check_id(&a.mission_id).map_err(|error| ConvertError::new("mission_id", error.to_string()))?;
-    sticky_scheduler(a.scheduler).map_err(|error| ConvertError::new("scheduler", error.to_string()))?;
+    check_id(&a.mission_id)?;
+    sticky_scheduler(a.scheduler)?;
     switching_cost(a.switching_cost)?;
     if a.revision == u64::MAX {
         return wrong("revision".to_owned(), "u64::MAX cannot be incremented");
@@ -159,10 +144,8 @@ pub(super) fn check_record(a: &v1::Assignment, overrides: &[v1::PairCost]) -> Re
             }
             let position = &member.position;
             if position.len() != dims || !(2..=3).contains(&dims) || position.iter().any(|x| !x.is_finite()) {
-                return wrong(
-                    format!("{field}[{k}].position"),
-                    "coordinates are not finite, or their number differs from other members",
-                );
+                let problem = "coordinates are not finite, or their number differs from other members";
+                return wrong(format!("{field}[{k}].position"), problem);
             }
             if !v1::MemberState::try_from(member.state).is_ok_and(|state| state != v1::MemberState::Unspecified) {
                 return wrong(format!("{field}[{k}].state"), "unknown");

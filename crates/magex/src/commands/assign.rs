@@ -7,7 +7,6 @@ use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
-use magex_runtime::client::ConnectError;
 use magex_runtime::exit;
 use magex_runtime::security::CallerArgs;
 use serde::Deserialize;
@@ -110,13 +109,9 @@ pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let clock = Instant::now();
     let response = runtime.block_on(async {
-        let channel = settings.connect(&args.connect).await.map_err(|error| match error {
-            ConnectError::Url(error) => usage(format!("--connect: {error}")),
-            ConnectError::Transport(error) => {
-                let reason = anyhow::Error::new(error);
-                let reason = reason.root_cause();
-                unavailable(format!("no commander at {}: {reason}; start one with `magex commander`", args.connect))
-            }
+        let channel = settings.connect(&args.connect).await.map_err(|error| match error.code {
+            exit::USAGE => usage(format!("--connect: {error}")),
+            _ => unavailable(format!("no commander at {}: {error}; start one with `magex commander`", args.connect)),
         })?;
         let mut client = CommanderServiceClient::new(channel);
         let call = client.assign(request);

@@ -11,7 +11,7 @@ use crate::ops::{Activation, constant};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
-use magex_assign::duals::{Schedule, sinkhorn_duals};
+use magex_assign::duals::sinkhorn_duals;
 
 /// Features of a pair.
 const FEATURES: usize = 10;
@@ -73,7 +73,7 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
     // to spread over all options.
     let mut filled = cost.clone();
     filled.resize(columns * columns, 0.0);
-    let duals = sinkhorn_duals(&filled, columns, columns, &Schedule::for_pairs(filled.len()))?;
+    let duals = sinkhorn_duals(&filled, columns, columns)?;
     let mean = (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12) as f32;
     let spacing = mean / (rows as f32).sqrt();
     let unit = MAGNIFY / spacing;

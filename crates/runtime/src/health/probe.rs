@@ -1,8 +1,7 @@
 //! Health check of a service, for orchestrators that run it inside the service's container.
 
-use crate::client::{UrlError, endpoint_with};
+use crate::client::{endpoint_from_env, root_of};
 use crate::exit::{self, Failure};
-use crate::tls::{ClientTls, TlsError};
 use std::time::Duration;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -17,86 +16,40 @@ pub const DEADLINE: Duration = Duration::from_secs(2);
 /// Bytes that are read of a page.
 const PAGE: u64 = 4096;
 
-/// Why a service is unhealthy.
-#[derive(Debug, thiserror::Error)]
-pub enum Unhealthy {
-    /// The URL is malformed.
-    #[error(transparent)]
-    Url(#[from] UrlError),
-    /// The certificates of the environment are unusable.
-    #[error("{0}")]
-    Tls(#[from] TlsError),
-    /// No connection, or no health service.
-    #[error("{url}: {reason}")]
-    Unreachable {
-        /// The URL.
-        url: String,
-        /// The reason.
-        reason: String,
-    },
-    /// It reports another status.
-    #[error("{url} reports {status}")]
-    NotServing {
-        /// The URL.
-        url: String,
-        /// The status.
-        status: String,
-    },
-    /// It does not answer in time.
-    #[error("{url} did not answer within {} s", .deadline.as_secs_f64())]
-    Late {
-        /// The URL.
-        url: String,
-        /// The timeout.
-        deadline: Duration,
-    },
-}
-
 /// Checks the service at `url` once. A URL without a path is checked over gRPC (grpc.health.v1) for `service`, or for the whole
 /// process if that is empty; https uses the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` name. A URL
 /// with a path is a page, such as http://host:port/healthz, that must answer 200.
-///
-/// # Errors
-/// The service is unhealthy.
-pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Unhealthy> {
+pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Failure> {
     let asking = async {
         match page_of(url) {
             Some((authority, path)) => ask_page(url, authority, path).await,
             None => ask_grpc(url, service).await,
         }
     };
-    let late = |_| Unhealthy::Late { url: url.to_owned(), deadline };
+    let late = |_| unhealthy(format!("{url} did not answer within {} s", deadline.as_secs_f64()));
     tokio::time::timeout(deadline, asking).await.map_err(late)?
 }
 
+fn unhealthy(problem: String) -> Failure {
+    Failure::new(exit::FAILURE, problem)
+}
+
 /// [`ask`] on its own runtime. Returns the exit code.
-///
-/// # Errors
-/// Wrong usage, or the service is unhealthy.
 pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .map_err(|error| Failure::new(exit::INTERNAL, error))?;
-    runtime.block_on(ask(url, service, deadline)).map(|()| exit::OK).map_err(|error| match &error {
-        Unhealthy::Url(_) | Unhealthy::Tls(_) => Failure::usage(&error),
-        _ => Failure::new(exit::FAILURE, &error),
-    })
+    runtime.block_on(ask(url, service, deadline)).map(|()| exit::OK)
 }
 
 /// Checks the service that was started on this machine with these options.
-///
-/// # Errors
-/// As [`run`].
 pub fn own(listen: &str, secure: bool) -> Result<u8, Failure> {
     let scheme = if secure { "https" } else { "http" };
     run(&format!("{scheme}://{}", reachable(listen)), "", DEADLINE)
 }
 
-/// Checks the HTTP server of the program that was started on this machine with these options.
-///
-/// # Errors
-/// As [`run`]; a missing address is wrong usage.
+/// Checks the HTTP server of the program that was started on this machine with these options. A missing address is wrong usage.
 pub fn own_page(listen: Option<&str>) -> Result<u8, Failure> {
     let listen = listen.ok_or_else(|| {
         Failure::usage("--health-check: needs the address of the HTTP server; set --http or MAGEX_HTTP")
@@ -124,35 +77,23 @@ fn page_of(url: &str) -> Option<(&str, &str)> {
     (path.len() > 1).then_some((authority, path))
 }
 
-async fn ask_grpc(url: &str, service: &str) -> Result<(), Unhealthy> {
-    let unreachable = |reason: String| Unhealthy::Unreachable { url: url.to_owned(), reason };
-    let secure = url.trim_start().to_ascii_lowercase().starts_with("https:");
-    let tls = if secure { Some(ClientTls::from_env()?) } else { None };
-    let endpoint = endpoint_with(url, tls.as_ref())?;
+async fn ask_grpc(url: &str, service: &str) -> Result<(), Failure> {
+    let unreachable = |reason: String| unhealthy(format!("{url}: {reason}"));
+    let endpoint = endpoint_from_env(url)?;
     let channel = endpoint.connect().await.map_err(|error| unreachable(root_of(&error)))?;
     let request = HealthCheckRequest { service: service.to_owned() };
     let answer = HealthClient::new(channel).check(request).await.map_err(|status| match status.code() {
         Code::NotFound => unreachable(format!("no service '{service}'")),
         code => unreachable(format!("{code:?}: {}", status.message())),
     })?;
-    let status = answer.into_inner().status();
-    if status == ServingStatus::Serving {
-        return Ok(());
+    match answer.into_inner().status() {
+        ServingStatus::Serving => Ok(()),
+        other => Err(unhealthy(format!("{url} reports {}", other.as_str_name()))),
     }
-    Err(Unhealthy::NotServing { url: url.to_owned(), status: status.as_str_name().to_owned() })
 }
 
-/// The innermost error: the outer ones carry no detail.
-fn root_of(error: &dyn std::error::Error) -> String {
-    let mut root = error;
-    while let Some(source) = root.source() {
-        root = source;
-    }
-    root.to_string()
-}
-
-async fn ask_page(url: &str, authority: &str, path: &str) -> Result<(), Unhealthy> {
-    let unreachable = |error: std::io::Error| Unhealthy::Unreachable { url: url.to_owned(), reason: error.to_string() };
+async fn ask_page(url: &str, authority: &str, path: &str) -> Result<(), Failure> {
+    let unreachable = |error: std::io::Error| unhealthy(format!("{url}: {error}"));
     let mut socket = TcpStream::connect(authority).await.map_err(unreachable)?;
     let request = format!("GET {path} HTTP/1.0\r\nHost: {authority}\r\n\r\n");
     socket.write_all(request.as_bytes()).await.map_err(unreachable)?;
@@ -164,7 +105,7 @@ async fn ask_page(url: &str, authority: &str, path: &str) -> Result<(), Unhealth
         return Ok(());
     }
     let status = if line.is_empty() { "nothing".to_owned() } else { format!("'{line}'") };
-    Err(Unhealthy::NotServing { url: url.to_owned(), status })
+    Err(unhealthy(format!("{url} reports {status}")))
 }
 
 #[cfg(test)]
@@ -200,7 +141,7 @@ mod tests {
         stop.cancel();
         serving.await.unwrap().unwrap();
         let error = ask(&url, "", SOON).await.unwrap_err();
-        assert!(matches!(error, Unhealthy::Unreachable { .. }), "{error}");
+        assert!(error.code == exit::FAILURE && error.message.starts_with(&format!("{url}: ")), "{error}");
     }
 
     #[tokio::test]
@@ -222,7 +163,7 @@ mod tests {
         let address = mute.local_addr().unwrap();
         for url in [format!("http://{address}"), format!("http://{address}/healthz")] {
             let error = ask(&url, "", Duration::from_millis(200)).await.unwrap_err();
-            assert!(matches!(error, Unhealthy::Late { .. }), "{error}");
+            assert!(error.code == exit::FAILURE && error.message.contains("did not answer within 0.2 s"), "{error}");
         }
     }
 

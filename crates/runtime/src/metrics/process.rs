@@ -1,5 +1,4 @@
-//! Metrics of the process itself, read from /proc/self. The `process` feature of the `prometheus` crate has the same metrics,
-//! but takes 32 s longer to build (`procfs`).
+//! Metrics of the process, from /proc/self. The `prometheus` crate has them too, but takes 32 s longer to build (`procfs`).
 
 use super::{Metrics, raise_to};
 use rustix::param::{clock_ticks_per_second, page_size};

@@ -9,6 +9,7 @@
 //! token_sha256 = "…"        # or certificate_sha256 = "…" (of the DER form)
 //! ```
 
+use crate::exit::Failure;
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
@@ -42,21 +43,13 @@ pub struct Caller {
     pub role: Role,
 }
 
-/// A file of identities cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{path}: {problem}")]
-pub struct AccessError {
-    path: String,
-    problem: String,
-}
-
 /// The identities that may call.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
     /// By SHA-256, lower-case hex. `None`: every caller that passes TLS is an admin.
     known: Option<HashMap<String, Caller>>,
-    /// At least one identity is known by its certificate.
-    certificates: bool,
+    /// At least one identity is known by its certificate, so the server must request client certificates.
+    pub(crate) certificates: bool,
 }
 
 #[derive(Deserialize)]
@@ -77,13 +70,10 @@ struct Identity {
 
 impl Access {
     /// Reads a file of identities.
-    ///
-    /// # Errors
-    /// The file cannot be read, or an identity is invalid.
-    pub fn read(path: &Path) -> Result<Self, AccessError> {
-        let wrong = |problem: String| AccessError { path: path.display().to_string(), problem };
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        Self::parse(&text).map_err(wrong)
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let text = std::fs::read_to_string(path).map_err(|error| error.to_string());
+        let access = text.and_then(|text| Self::parse(&text));
+        access.map_err(|problem| Failure::usage(format!("{}: {problem}", path.display())))
     }
 
     fn parse(text: &str) -> Result<Self, String> {
@@ -120,15 +110,8 @@ impl Access {
         self.known.is_some()
     }
 
-    /// At least one identity is known by its certificate, so the server must request client certificates.
-    pub fn needs_certificates(&self) -> bool {
-        self.certificates
-    }
-
     /// Authenticates a call by its `authorization` header, or else by its client certificate.
-    ///
-    /// # Errors
-    /// UNAUTHENTICATED: the credentials are missing or unknown.
+    /// Missing or unknown credentials are UNAUTHENTICATED.
     pub fn authenticate<T>(&self, request: &http::Request<T>) -> Result<Caller, Status> {
         let tls = request.extensions().get::<TlsConnectInfo<TcpConnectInfo>>();
         let certificate = tls
@@ -161,10 +144,7 @@ impl Access {
     }
 }
 
-/// The authenticated caller of a request, if its role is among `allowed`. Admins are always allowed.
-///
-/// # Errors
-/// PERMISSION_DENIED: the caller has another role.
+/// The caller of a request, if its role is among `allowed` or admin; otherwise PERMISSION_DENIED.
 pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Status> {
     let Some(caller) = request.extensions().get::<Caller>() else {
         return Err(Status::internal("the call was not authenticated"));

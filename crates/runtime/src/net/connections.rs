@@ -1,5 +1,4 @@
-//! Connection table: enforces total and per-peer limits and closes connections that send no call within
-//! [`ConnectionLimits::first_call`].
+//! Connection table: limits in total and per peer, and the time to the first call ([`ConnectionLimits::first_call`]).
 //!
 //! A connection is `Silent` until its first call, `Probed` after a call to a public service (health, reflection, the HTTP
 //! page), and `Called` after an authenticated call. A `Silent` connection is closed after `first_call`, handshakes included.
@@ -7,13 +6,14 @@
 //! evicts itself and callers with credentials still get in. A `Called` connection is never evicted.
 
 use crate::net::in_flight::{InFlight, InFlightLimits};
+use crate::sync::lock;
 use std::collections::{BTreeMap, HashMap};
 use std::future::Future as _;
 use std::io::{Error, ErrorKind, IoSlice};
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
@@ -30,32 +30,11 @@ const ANONYMOUS: InFlightLimits = InFlightLimits { calls: 256, streams: 64, call
 /// Pause after a failed accept (no file descriptors are left).
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// What a connection has sent so far. A state is only ever raised.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-enum State {
-    /// No call.
-    Silent,
-    /// A call to a public service.
-    Probed,
-    /// An authenticated call.
-    Called,
-}
-
-/// The state of a connection, read by its socket with every read and write without the lock of the table.
-#[derive(Debug, Default)]
-struct SharedState(AtomicU8);
-
-impl SharedState {
-    fn is(&self, state: State) -> bool {
-        self.0.load(Ordering::Relaxed) == state as u8
-    }
-
-    /// Raises the state; whether that changed it.
-    fn raise(&self, state: State) -> bool {
-        self.0.fetch_max(state as u8, Ordering::Relaxed) < state as u8
-    }
-}
+/// What a connection has sent so far: no call, a call to a public service, or an authenticated call. A state is only ever raised,
+/// and a socket reads its own with every read and write, without the lock of the table.
+const SILENT: u8 = 0;
+const PROBED: u8 = 1;
+const CALLED: u8 = 2;
 
 /// Limits of the connections of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,7 +73,7 @@ struct Table {
 #[derive(Debug)]
 struct Entry {
     number: u64,
-    state: Arc<SharedState>,
+    state: Arc<AtomicU8>,
     close: CancellationToken,
 }
 
@@ -112,18 +91,17 @@ impl Connections {
 
     /// An authenticated call arrived on the connection from this address: it is no longer evicted.
     pub fn called(&self, address: SocketAddr) {
-        let mut table = self.lock();
+        let mut table = lock(&self.table);
         let Some(entry) = table.open.get(&address) else { return };
-        if entry.state.raise(State::Called) {
-            let number = entry.number;
-            table.waiting.remove(&number);
-        }
+        entry.state.store(CALLED, Ordering::Relaxed);
+        let number = entry.number;
+        table.waiting.remove(&number);
     }
 
     /// A call to a public service arrived: the connection stays until it is evicted.
     pub fn probed(&self, address: SocketAddr) {
-        if let Some(entry) = self.lock().open.get(&address) {
-            entry.state.raise(State::Probed);
+        if let Some(entry) = lock(&self.table).open.get(&address) {
+            entry.state.fetch_max(PROBED, Ordering::Relaxed);
         }
     }
 
@@ -132,14 +110,9 @@ impl Connections {
         &self.anonymous
     }
 
-    /// Connections that are open.
-    pub fn open(&self) -> usize {
-        self.lock().open.len()
-    }
-
     /// Adds a connection; `None` at a limit when no connection can be evicted.
     fn admit(&self, address: SocketAddr) -> Option<Slot> {
-        let mut table = self.lock();
+        let mut table = lock(&self.table);
         let of_peer = |table: &Table| table.peers.get(&address.ip()).copied().unwrap_or(0);
         if of_peer(&table) >= self.limits.per_peer {
             let oldest = table.waiting.values().copied().find(|waiting| waiting.ip() == address.ip())?;
@@ -148,7 +121,7 @@ impl Connections {
             let oldest = table.waiting.values().copied().next()?;
             table.close(oldest);
         }
-        let (number, state, close) = (table.next, Arc::<SharedState>::default(), CancellationToken::new());
+        let (number, state, close) = (table.next, Arc::new(AtomicU8::new(SILENT)), CancellationToken::new());
         table.next += 1;
         // The system reuses an address only after the old connection has ended; its entry may still be there.
         table.close(address);
@@ -159,11 +132,6 @@ impl Connections {
         let first_call = Box::pin(tokio::time::sleep(self.limits.first_call));
         let evicted = Box::pin(close.cancelled_owned());
         Some(Slot { connections: self.clone(), address, number, state, first_call, evicted })
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Table> {
-        // Counting cannot fail half-way.
-        self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -188,7 +156,7 @@ struct Slot {
     connections: Connections,
     address: SocketAddr,
     number: u64,
-    state: Arc<SharedState>,
+    state: Arc<AtomicU8>,
     first_call: Pin<Box<Sleep>>,
     evicted: Pin<Box<WaitForCancellationFutureOwned>>,
 }
@@ -196,13 +164,14 @@ struct Slot {
 impl Slot {
     /// Fails once the connection was evicted or has sent no call in time.
     fn check(&mut self, cx: &mut Context<'_>) -> Result<(), Error> {
-        if self.state.is(State::Called) {
+        let state = self.state.load(Ordering::Relaxed);
+        if state == CALLED {
             return Ok(());
         }
         if self.evicted.as_mut().poll(cx).is_ready() {
             return Err(Error::new(ErrorKind::ConnectionAborted, "evicted at the connection limit"));
         }
-        if self.state.is(State::Silent) && self.first_call.as_mut().poll(cx).is_ready() {
+        if state == SILENT && self.first_call.as_mut().poll(cx).is_ready() {
             return Err(Error::new(ErrorKind::TimedOut, "no call arrived in time"));
         }
         Ok(())
@@ -211,7 +180,7 @@ impl Slot {
 
 impl Drop for Slot {
     fn drop(&mut self) {
-        let mut table = self.connections.lock();
+        let mut table = lock(&self.connections.table);
         if table.open.get(&self.address).is_some_and(|entry| entry.number == self.number) {
             table.close(self.address);
         }
@@ -292,16 +261,6 @@ impl Incoming {
     pub fn connections(&self) -> Connections {
         self.connections.clone()
     }
-
-    fn take(&self, stream: TcpStream, address: SocketAddr) -> Option<Connection> {
-        let Some(slot) = self.connections.admit(address) else {
-            tracing::debug!(peer = %address, "connection limit reached; connection rejected");
-            return None;
-        };
-        // Without Nagle's delay. A connection that is already closed fails with its first read.
-        let _ = stream.set_nodelay(true);
-        Some(Connection { stream, slot })
-    }
 }
 
 impl axum::serve::Listener for Incoming {
@@ -333,11 +292,14 @@ impl Stream for Incoming {
                 self.pause = None;
             }
             match std::task::ready!(self.listener.poll_accept(cx)) {
-                Ok((stream, address)) => {
-                    if let Some(connection) = self.take(stream, address) {
-                        return Poll::Ready(Some(Ok(connection)));
+                Ok((stream, address)) => match self.connections.admit(address) {
+                    Some(slot) => {
+                        // Without Nagle's delay. A connection that is already closed fails with its first read.
+                        let _ = stream.set_nodelay(true);
+                        return Poll::Ready(Some(Ok(Connection { stream, slot })));
                     }
-                }
+                    None => tracing::debug!(peer = %address, "connection limit reached; connection rejected"),
+                },
                 Err(error) => {
                     tracing::warn!(%error, "accept failed");
                     self.pause = Some(Box::pin(tokio::time::sleep(PAUSE)));
@@ -350,6 +312,12 @@ impl Stream for Incoming {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Connections {
+        pub(crate) fn open(&self) -> usize {
+            lock(&self.table).open.len()
+        }
+    }
 
     fn address(host: u8, port: u16) -> SocketAddr {
         ([127, 0, 0, host], port).into()
@@ -379,7 +347,7 @@ mod tests {
         assert!(closed(&mut other) && !closed(&mut second) && !closed(&mut third));
         drop((second, third, other, another));
         assert_eq!(connections.open(), 0);
-        assert!(connections.lock().peers.is_empty() && connections.lock().waiting.is_empty());
+        assert!(lock(&connections.table).peers.is_empty() && lock(&connections.table).waiting.is_empty());
     }
 
     #[tokio::test]

@@ -1,18 +1,21 @@
-//! The layer in front of a service: it authenticates a call, counts what the caller has in flight, and counts messages while
-//! they arrive. It decides from the headers of a call and the announced length of a message, before anything is decoded.
+//! The layer in front of a service: it authenticates a call, counts what the caller has in flight and what arrives, and ends
+//! the call at its deadline. It decides from headers and announced lengths, before anything is decoded.
 
 mod truncate_status;
 
 use crate::net::auth::{Access, Caller, Role, peer_address};
+use crate::net::call_metrics::Calls;
 use crate::net::connections::Connections;
+use crate::net::deadline::{self, Deadline};
 use crate::net::in_flight::{CallKind, InFlight, Permit};
-use http_body::{Frame, SizeHint};
+use http_body::Frame;
+use http_body_util::BodyExt as _;
 use std::convert::Infallible;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::time::Sleep;
 use tonic::Status;
 use tonic::body::Body;
@@ -43,6 +46,8 @@ pub struct Rules {
     pub streams: &'static [&'static str],
     /// Longest message, bytes; the service itself rejects longer ones.
     pub message_bytes: usize,
+    /// Where calls are counted, if anywhere.
+    pub calls: Option<Calls>,
 }
 
 /// Which calls a [`Guard`] accepts.
@@ -97,6 +102,9 @@ impl<S> Guard<S> {
                 (permit, kind, Limit { bytes: ANONYMOUS_MESSAGE, strict: true })
             }
         };
+        if let Some(deadline) = Deadline::of(request.headers()) {
+            request.extensions_mut().insert(deadline);
+        }
         let permit = Arc::new(permit);
         let metered = permit.clone();
         Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, limit))), permit))
@@ -123,17 +131,40 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        let (request, permit) = match self.admit(request) {
-            Ok(admitted) => admitted,
-            Err(status) => return Box::pin(std::future::ready(Ok(status.into_http()))),
+        let calls = match &*self.policy {
+            Policy::Guarded(rules) => rules.calls.clone(),
+            Policy::Public => None,
         };
-        let answer = self.service.call(request);
+        let counted = calls.map(|calls| (calls.method(request.uri().path()), calls, Instant::now()));
+        let admitted = self.admit(request).map(|(request, permit)| {
+            let deadline = request.extensions().get().copied();
+            (deadline::within(deadline, self.service.call(request)), permit)
+        });
         Box::pin(async move {
-            let mut response = answer.await?;
-            truncate_status(response.headers_mut());
-            Ok(response.map(|body| Body::new(Permitted { body, _permit: permit })))
+            let response = match admitted {
+                Ok((answer, permit)) => finish(answer.await?, permit),
+                Err(status) => status.into_http(),
+            };
+            if let Some((method, calls, start)) = counted {
+                calls.count(method, response.headers(), start.elapsed());
+            }
+            Ok(response)
         })
     }
+}
+
+/// Cuts the texts of statuses, and holds the permit until the last frame is sent.
+fn finish(mut response: http::Response<Body>, permit: Arc<Permit>) -> http::Response<Body> {
+    truncate_status(response.headers_mut());
+    response.map(|body| {
+        Body::new(body.map_frame(move |mut frame| {
+            let _held = &permit;
+            if let Some(trailers) = frame.trailers_mut() {
+                truncate_status(trailers);
+            }
+            frame
+        }))
+    })
 }
 
 fn kind(uri: &http::Uri, streams: &[&str]) -> CallKind {
@@ -233,43 +264,6 @@ impl http_body::Body for Metered {
             _ => {}
         }
         next
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
-/// A response's body that holds the permit until its last frame is sent.
-struct Permitted {
-    body: Body,
-    _permit: Arc<Permit>,
-}
-
-impl http_body::Body for Permitted {
-    type Data = tonic::codegen::Bytes;
-    type Error = Status;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
-        let mut next = Pin::new(&mut self.body).poll_frame(cx);
-        if let Poll::Ready(Some(Ok(frame))) = &mut next
-            && let Some(trailers) = frame.trailers_mut()
-        {
-            truncate_status(trailers);
-        }
-        next
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 

@@ -2,8 +2,9 @@
 
 use crate::net::auth::Caller;
 use crate::status;
+use crate::sync::lock;
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -63,13 +64,11 @@ impl InFlight {
     }
 
     /// Counts one more call, until the permit is dropped.
-    ///
-    /// # Errors
-    /// RESOURCE_EXHAUSTED: the caller is at its limit. UNAVAILABLE: the service drains.
+    /// At the limit: RESOURCE_EXHAUSTED; while the service drains: UNAVAILABLE.
     pub fn acquire(self: &Arc<Self>, caller: &Caller, kind: CallKind) -> Result<Permit, Status> {
         self.check_open()?;
         let limit = if kind == CallKind::Call { self.limits.calls } else { self.limits.streams };
-        let mut usage = self.lock();
+        let mut usage = lock(&self.usage);
         let count = &mut usage.callers.entry(caller.name.clone()).or_default().counts[kind as usize];
         if *count >= limit {
             let what = if kind == CallKind::Call { "calls in flight" } else { "open streams" };
@@ -82,21 +81,13 @@ impl InFlight {
     }
 
     /// Rejects calls while the service drains.
-    ///
-    /// # Errors
-    /// UNAVAILABLE.
     pub fn check_open(&self) -> Result<(), Status> {
         if self.draining.is_cancelled() { Err(stopping()) } else { Ok(()) }
     }
 
     /// Calls of a kind in flight, of all callers.
     pub fn count(&self, kind: CallKind) -> usize {
-        self.lock().callers.values().map(|caller| caller.counts[kind as usize]).sum()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Usage> {
-        // Counting cannot fail half-way.
-        self.usage.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.usage).callers.values().map(|caller| caller.counts[kind as usize]).sum()
     }
 }
 
@@ -116,14 +107,11 @@ pub struct Permit {
 }
 
 impl Permit {
-    /// Counts a message of this length, which replaces the previous message of the call.
-    ///
-    /// # Errors
-    /// RESOURCE_EXHAUSTED: the bytes in flight would exceed a limit.
+    /// Counts a message of this length, which replaces the previous message of the call. Beyond a limit: RESOURCE_EXHAUSTED.
     pub fn reserve(&self, length: usize) -> Result<(), Status> {
-        let mut own = self.bytes.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut own = lock(&self.bytes);
         let limits = &self.in_flight.limits;
-        let mut usage = self.in_flight.lock();
+        let mut usage = lock(&self.in_flight.usage);
         let before = std::mem::take(&mut *own);
         usage.bytes -= before;
         let all = usage.bytes + length;
@@ -149,7 +137,7 @@ impl Permit {
 impl Drop for Permit {
     fn drop(&mut self) {
         let own = *self.bytes.get_mut().unwrap_or_else(PoisonError::into_inner);
-        let mut usage = self.in_flight.lock();
+        let mut usage = lock(&self.in_flight.usage);
         usage.bytes -= own;
         if let Some(caller) = usage.callers.get_mut(&self.name) {
             caller.counts[self.kind as usize] = caller.counts[self.kind as usize].saturating_sub(1);
@@ -205,7 +193,7 @@ mod tests {
         a.reserve(10).unwrap();
         b.reserve(100).unwrap();
         drop((a, second, b));
-        let usage = in_flight.lock();
+        let usage = lock(&in_flight.usage);
         assert!(usage.bytes == 0 && usage.callers.is_empty());
     }
 }

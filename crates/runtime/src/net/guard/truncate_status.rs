@@ -1,5 +1,4 @@
-//! Keeps error statuses within the header sizes that clients accept: many reject a header list over 8 or 16 KiB and report
-//! an internal error instead of ours.
+//! Keeps error statuses within the header sizes that clients accept; beyond, many report an internal error instead.
 
 use tonic::codegen::http::{HeaderMap, HeaderValue};
 
