@@ -36,7 +36,7 @@ impl RunFolderState {
         if names.is_empty() {
             return Self::Empty;
         }
-        if checkpoint::list(out).is_ok_and(|checkpoints| !checkpoints.is_empty()) {
+        if !checkpoint::list(out).is_empty() {
             return Self::Run;
         }
         let has = |name: &str| names.iter().any(|own| own == name);

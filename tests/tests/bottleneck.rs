@@ -120,7 +120,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
     let stages = trained.map(|line| line["timing"]["bottleneck"]["stage"].as_str().unwrap().to_owned()).collect();
     let weights = trainer.learned().weights().unwrap();
     runtime.shutdown_background();
-    (stages, magex_learner::checkpoint::sha256_hex(&weights))
+    (stages, magex_core::sha256::hex(&weights))
 }
 
 /// Most of the iterations say so: what else runs on the machine may blur one.

@@ -89,17 +89,9 @@ impl std::fmt::Display for Table {
     }
 }
 
-/// 12345.6 → `12,346`.
+/// 12345.6 → `12,346`; at least zero.
 pub fn thousands(value: f64) -> String {
-    let digits = format!("{:.0}", value.abs());
-    let mut out = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(digit);
-    }
-    if value < 0.0 && digits != "0" { format!("-{out}") } else { out }
+    indicatif::HumanCount(value.round() as u64).to_string()
 }
 
 /// A span of time.

@@ -121,8 +121,8 @@ impl Progress {
                 Err(error) => tracing::warn!(%error, "the metrics of an iteration are malformed"),
             },
             RunEvent::Log(text) => tracing::info!("{text}"),
-            RunEvent::Checkpoint { iteration, path } => tracing::debug!(%iteration, path, "checkpoint"),
-            RunEvent::Finished { .. } => self.status("finished"),
+            RunEvent::Checkpoint(e) => tracing::debug!(iteration = e.iteration, path = e.path, "checkpoint"),
+            RunEvent::Finished(_) => self.status("finished"),
         }
     }
 

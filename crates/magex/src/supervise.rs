@@ -8,11 +8,9 @@ pub mod service;
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
-use magex_core::ids::Iteration;
-use magex_learner::run_events::{IterationReport, RunEvent};
+use magex_learner::run_events::RunEvent;
 use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
-use magex_proto::v1::watch_run_response::Event;
 use magex_runtime::{client, exit, shutdown};
 use service::{Service, code_of, keep};
 use std::path::Path;
@@ -36,7 +34,6 @@ pub(crate) enum TrainEnd {
 /// Actor processes and their threads.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ActorPlan {
-    /// Number of processes.
     pub(crate) actors: usize,
     /// Rollout threads of each.
     pub(crate) threads: usize,
@@ -51,7 +48,6 @@ pub(crate) struct ServicesPlan<'a> {
     pub(crate) threads: usize,
     /// Address of the live page, if there is one.
     pub(crate) http: Option<&'a str>,
-    /// The actors.
     pub(crate) actors: ActorPlan,
 }
 
@@ -163,7 +159,7 @@ fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
     let trained =
         serde_json::from_str::<serde_json::Value>(&report.metrics_json).is_ok_and(|v| !v["executor"].is_null());
     // The last line only evaluates: it has the number of the line before it.
-    let place = (report.iteration.0, !trained);
+    let place = (report.iteration, !trained);
     let new = place > *shown;
     *shown = place.max(*shown);
     new
@@ -193,20 +189,9 @@ async fn follow(url: &str, events: &mpsc::Sender<RunEvent>) -> anyhow::Result<()
     let opened = tokio::time::timeout(Duration::from_secs(10), client.watch_run(v1::WatchRunRequest {})).await;
     let mut stream = opened??.into_inner();
     while let Some(message) = stream.message().await? {
-        let event = match message.event {
-            Some(Event::Iteration(e)) => RunEvent::Iteration(IterationReport {
-                iteration: Iteration(e.iteration),
-                joint_env_steps: e.joint_env_steps,
-                success: e.success,
-                reward: e.reward,
-                metrics_json: e.metrics_json,
-            }),
-            Some(Event::Log(text)) => RunEvent::Log(text),
-            Some(Event::Checkpoint(e)) => RunEvent::Checkpoint { iteration: Iteration(e.iteration), path: e.path },
-            Some(Event::Finished(e)) => RunEvent::Finished { summary_json: e.summary_json },
-            None => continue,
-        };
-        events.send(event).await?;
+        if let Some(event) = message.event {
+            events.send(event).await?;
+        }
     }
     Ok(())
 }
@@ -216,13 +201,8 @@ mod tests {
     use super::*;
 
     fn event(iteration: u32, executor: &str) -> RunEvent {
-        RunEvent::Iteration(IterationReport {
-            iteration: Iteration(iteration),
-            joint_env_steps: 0,
-            success: None,
-            reward: None,
-            metrics_json: format!("{{\"executor\":{executor}}}"),
-        })
+        let metrics_json = format!("{{\"executor\":{executor}}}");
+        RunEvent::Iteration(v1::IterationEvent { iteration, metrics_json, ..Default::default() })
     }
 
     #[test]

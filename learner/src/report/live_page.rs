@@ -1,9 +1,9 @@
 //! The live page as an observer of the run.
 
-use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::{RunObserver, RunStart};
-use crate::run_events::IterationReport;
+use crate::report::records::IterationMetrics;
 use magex_core::trajectory::EvalOutcome;
+use magex_proto::v1::IterationEvent;
 use magex_proto::weights::Weights;
 use magex_viewer::page::{LivePage, Phase, RunEnd};
 use std::sync::Arc;
@@ -29,7 +29,7 @@ impl RunObserver for Arc<LivePage> {
         LivePage::evaluated(self, outcomes);
     }
 
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         self.line(&report.metrics_json);
     }
 

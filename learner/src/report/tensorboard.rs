@@ -6,9 +6,9 @@
 //!
 //! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
 
-use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::RunObserver;
-use crate::run_events::IterationReport;
+use crate::report::records::IterationMetrics;
+use magex_proto::v1::IterationEvent;
 use prost::Message;
 use serde_json::Value;
 use std::fs::{File, OpenOptions};
@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Folder of the event files in a run folder.
-pub const FOLDER: &str = "tensorboard";
+const FOLDER: &str = "tensorboard";
 
 /// What the names of the files begin with.
 const PREFIX: &str = "events.out.tfevents.";
@@ -67,12 +67,7 @@ struct SessionLog {
 
 /// Writes event files. An error is logged once and ends the writing; training continues.
 #[derive(Debug)]
-pub struct EventFile {
-    state: State,
-}
-
-#[derive(Debug)]
-enum State {
+pub(crate) enum EventFile {
     /// Nothing is written after an error.
     Off,
     /// No file yet: the folder, and the steps that a resumed run continues from.
@@ -82,24 +77,24 @@ enum State {
 
 impl EventFile {
     /// In a run folder; `resumed` is the number of steps that the run continues from. The file appears with the first line.
-    pub fn new(folder: &Path, resumed: Option<u64>) -> Self {
-        Self { state: State::Waiting(folder.join(FOLDER), resumed) }
+    pub(crate) fn new(folder: &Path, resumed: Option<u64>) -> Self {
+        Self::Waiting(folder.join(FOLDER), resumed)
     }
 
     /// Writes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
-    pub fn append(&mut self, line: &str, step: u64) {
+    fn append(&mut self, line: &str, step: u64) {
         if let Err((path, error)) = self.write(line, step) {
             tracing::warn!(path = %path.display(), %error, "no more TensorBoard events will be written");
-            self.state = State::Off;
+            *self = Self::Off;
         }
     }
 
     fn write(&mut self, line: &str, step: u64) -> Result<(), (PathBuf, Error)> {
-        if let State::Waiting(folder, resumed) = &self.state {
+        if let Self::Waiting(folder, resumed) = self {
             let (file, path) = open(folder, *resumed).map_err(|error| (folder.clone(), error))?;
-            self.state = State::Open(file, path);
+            *self = Self::Open(file, path);
         }
-        let State::Open(file, path) = &mut self.state else { return Ok(()) };
+        let Self::Open(file, path) = self else { return Ok(()) };
         let mut values = Vec::new();
         if let Ok(line) = serde_json::from_str(line) {
             scalars("", &line, &mut values);
@@ -111,7 +106,7 @@ impl EventFile {
 }
 
 impl RunObserver for EventFile {
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         self.append(&report.metrics_json, report.joint_env_steps);
     }
 }
@@ -145,8 +140,8 @@ fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
         match value {
             Value::Number(number) => {
                 let group = if group.is_empty() { "run" } else { group };
-                let value = number.as_f64().map(|x| x as f32);
-                out.push(Scalar { tag: format!("{group}/{name}"), simple_value: value });
+                let simple_value = number.as_f64().map(|x| x as f32);
+                out.push(Scalar { tag: format!("{group}/{name}"), simple_value });
             }
             Value::Object(_) if group.is_empty() => scalars(name, value, out),
             Value::Object(_) => scalars(&format!("{group}/{name}"), value, out),

@@ -1,8 +1,8 @@
 //! The learner's Prometheus metrics, each declared once; docs/metrics.md describes them.
 
 use crate::report::bottleneck::{Bottleneck, Stage};
-use crate::report::metrics_file::IterationMetrics;
-use crate::serve::ledger;
+use crate::report::records::IterationMetrics;
+use crate::serve::ledger::Counters;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
@@ -123,7 +123,7 @@ impl LearnerMetrics {
     }
 
     /// Sets the metrics of the ledger. Called under its lock.
-    pub(crate) fn ledger(&self, shards: &ledger::Counters, episodes: &ledger::Counters, queued: usize) {
+    pub(crate) fn ledger(&self, shards: &Counters, episodes: &Counters, queued: usize) {
         self.shards.set(shards);
         self.episodes.set(episodes);
         self.queue("shards", queued);
@@ -162,18 +162,17 @@ impl LearnerMetrics {
             self.phase.with_label_values(&[phase]).observe(seconds.max(0.0));
         }
         let Bottleneck { stage, actor_s, learner_s, network_s, .. } = timing.bottleneck;
-        self.bottleneck.with_label_values(&[stage.name()]).inc_by(1);
+        self.bottleneck.with_label_values(&[stage.name()]).inc();
         for (stage, seconds) in Stage::ALL.iter().zip([actor_s, learner_s, network_s]) {
             self.bottleneck_seconds.with_label_values(&[stage.name()]).set(seconds);
         }
         if let Some(skipped) = metrics.executor.as_ref().and_then(|update| update.get("skipped_minibatches")) {
             self.skipped.inc_by(skipped as u64);
         }
-        if let Some(success) = metrics.episodes.get(SUCCESS_RATE) {
-            self.success.set(success);
-        }
-        if let Some(reward) = metrics.episodes.get(REWARD) {
-            self.reward.set(reward);
+        for (gauge, metric) in [(&self.success, SUCCESS_RATE), (&self.reward, REWARD)] {
+            if let Some(value) = metrics.episodes.get(metric) {
+                gauge.set(value);
+            }
         }
     }
 
@@ -213,11 +212,11 @@ impl LeaseMetrics {
         }
     }
 
-    fn set(&self, c: &ledger::Counters) {
+    fn set(&self, c: &Counters) {
         let totals = [c.leased, c.trained, c.duplicate, c.expired, c.rejected, c.failed];
         self.counters.iter().zip(totals).for_each(|(counter, total)| raise_to(counter, total));
         self.outstanding.set(c.outstanding as f64);
-        self.residual.set(c.residual() as f64);
+        self.residual.set(c.residual as f64);
     }
 }
 

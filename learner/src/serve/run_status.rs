@@ -1,6 +1,6 @@
 //! The answer of `GetRun`, assembled from the four parts of the service.
 
-use crate::serve::ledger::{Counters, Ledger};
+use crate::serve::ledger::Ledger;
 use crate::serve::shared::Shared;
 use magex_core::ids::ShardKind;
 use magex_proto::v1;
@@ -11,7 +11,7 @@ impl Shared {
         let latest = self.board.latest();
         let sessions = self.roster.sessions();
         // One lock for the state, the counters and the leases, so that they agree with each other.
-        let mut status = self.work.inspect(|ledger| {
+        self.work.inspect(|ledger| {
             let (done, total) = ledger.progress();
             let rows = sessions.into_iter().map(|(session, actor)| v1::ActorStatus {
                 leases: ledger.leases_of(session) as u32,
@@ -24,24 +24,20 @@ impl Shared {
             });
             let actors: Vec<v1::ActorStatus> = rows.collect();
             v1::RunStatus {
+                run_id: self.run.run_id.0.clone(),
+                name: self.run.name.clone(),
+                task_fingerprint: self.run.task_fingerprint.clone(),
                 state: self.run_state(actors.len(), ledger).into(),
                 actors,
-                ledger: Some(ledger_status(&ledger.counters())),
-                episodes: Some(ledger_status(&ledger.episodes())),
+                ledger: Some(ledger.counters()),
+                episodes: Some(ledger.episodes()),
                 shards_done: done as u32,
                 shards_total: total as u32,
-                ..v1::RunStatus::default()
+                weights_version: latest.as_ref().map_or(0, |weights| weights.version.0),
+                weights_sha256: latest.as_ref().map_or_else(String::new, |weights| weights.sha256.clone()),
+                ..self.status.reported()
             }
-        });
-        self.status.fill(&mut status);
-        status.run_id.clone_from(&self.run.run_id.0);
-        status.name.clone_from(&self.run.name);
-        status.task_fingerprint.clone_from(&self.run.task_fingerprint);
-        if let Some(weights) = latest {
-            status.weights_version = weights.version.0;
-            status.weights_sha256.clone_from(&weights.sha256);
-        }
-        status
+        })
     }
 
     fn run_state(&self, actors: usize, ledger: &Ledger) -> v1::RunState {
@@ -59,18 +55,5 @@ impl Shared {
         } else {
             v1::RunState::Collecting
         }
-    }
-}
-
-fn ledger_status(counters: &Counters) -> v1::LedgerStatus {
-    v1::LedgerStatus {
-        leased: counters.leased,
-        trained: counters.trained,
-        duplicate: counters.duplicate,
-        expired: counters.expired,
-        rejected: counters.rejected,
-        failed: counters.failed,
-        outstanding: counters.outstanding,
-        residual: counters.residual() as i64,
     }
 }

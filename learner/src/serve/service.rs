@@ -1,5 +1,6 @@
 //! The learner's gRPC service, and its server.
 
+use crate::report::bottleneck::CollectTiming;
 use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
@@ -45,8 +46,8 @@ pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, Grpc
             shared.refresh_gauges();
         }
     });
-    let security = Security::default();
-    (LearnerHandle { shared: shared.clone(), security }, GrpcCollector::new(shared))
+    let collector = GrpcCollector { shared: shared.clone(), timing: CollectTiming::default() };
+    (LearnerHandle { shared, security: Security::default() }, collector)
 }
 
 /// The network's end of the service.
@@ -125,7 +126,7 @@ impl LearnerHandle {
 
     /// The observer through which the training thread reports to the service.
     pub fn observer(&self) -> ServiceObserver {
-        ServiceObserver::new(self.shared.clone())
+        ServiceObserver { shared: self.shared.clone() }
     }
 
     /// Returns after the first request to stop: a drain or a shutdown.

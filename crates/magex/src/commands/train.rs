@@ -3,7 +3,7 @@
 use crate::artifacts::{run_name, write_curve, write_recorded_replay};
 use crate::failure::{coded, usage};
 use crate::folder;
-use crate::local::{EventChannel, LocalCollector};
+use crate::local::LocalCollector;
 use crate::options::CommonOptions;
 use crate::output::{Output, note, program, seconds, thousands};
 use crate::progress::Progress;
@@ -13,7 +13,7 @@ use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
-use magex_learner::report::metrics_file::Summary;
+use magex_learner::report::records::Summary;
 use magex_learner::trainer::{TrainError, TrainOutcome, Trainer};
 use magex_runtime::{backoff, exit, http, server, shutdown};
 use magex_viewer::page::{LivePage, RunInfo};
@@ -237,7 +237,7 @@ fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) 
     }
 
     let (events, received) = mpsc::channel();
-    trainer.observe(EventChannel(events));
+    trainer.observe(events);
     let mut collector = LocalCollector::new(&plan.config, plan.threads, stop);
     let outcome = std::thread::scope(|scope| {
         let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);

@@ -15,8 +15,8 @@ use magex_assign::exact_points;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::sha256;
 use magex_core::task::Spawn;
-use magex_learner::checkpoint::sha256_hex;
 use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
 use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
@@ -141,7 +141,7 @@ impl Training {
         metrics.sync_all().context("metrics.jsonl")?;
         let weights = to_safetensors(&[("commander", &network.params)], "{\"format\":1}")?;
         let summary = json!({
-            "weights_sha256": sha256_hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
+            "weights_sha256": sha256::hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
             "batch": batch, "synthetic_instances": u64::from(imitation + ppo) * u64::from(batch),
             "cost_ratio": named(&measured), "untrained_cost_ratio": named(&untrained),
             "wall_s": clock.elapsed().as_secs_f64(),
