@@ -1,7 +1,7 @@
 //! The actor's command line.
 
 use crate::policy_worker::PolicyWorker;
-use crate::run::{ActorConfig, ActorError, ActorReport, run_watched};
+use crate::run::{self, ActorConfig, ActorError, ActorReport};
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_runtime::exit::{self, Failure};
@@ -59,7 +59,7 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
     let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
         context.announce(http::routes(metrics.clone()));
-        run_watched(config, PolicyWorker::maker(), &metrics, context.stop).await.map_err(|error| match &error {
+        run::run(config, PolicyWorker::maker(), metrics, context.stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
             ActorError::Evicted { .. } => Failure::new(exit::INTERNAL, &error),

@@ -1,11 +1,12 @@
 //! The worker of production: it rolls out shards with the executor that their weights contain.
 
-use crate::goal_client::GoalSource;
+use crate::goal_client::GrpcGoals;
 use crate::rollout::{Roller, RolloutError};
-use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
+use crate::worker::{MakeWorker, WorkError, Worker};
 use magex_core::config::RunConfig;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
+use magex_proto::v1::Welcome;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
 
@@ -13,6 +14,7 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub struct PolicyWorker {
     config: RunConfig,
+    /// With the SHA-256 of its weights.
     roller: Option<(String, Roller)>,
 }
 
@@ -51,7 +53,7 @@ impl PolicyWorker {
 }
 
 impl Worker for PolicyWorker {
-    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         self.roller(weights)?.rollout(shard, |request| goals.assign(request)).map_err(|error| match error {
             RolloutError::Goals(error) => WorkError::Goals(error),
             other => WorkError::fatal(other.to_string()),

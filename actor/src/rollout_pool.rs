@@ -1,22 +1,22 @@
 //! The rollout threads of one run.
 
-use crate::goal_client::{GrpcGoals, WeightsKey};
+use crate::goal_client::{GoalError, GrpcGoals, WeightsKey};
 use crate::metrics::ActorMetrics;
-use crate::weights_cache::{CacheError, WeightsCache};
-use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
+use crate::weights_cache::WeightsCache;
+use crate::worker::{MakeWorker, WorkError, Worker};
 use bytes::Bytes;
 use magex_core::config::RunConfig;
-use magex_core::ids::Shard;
+use magex_core::ids::{RunId, Shard};
 use magex_core::task::TaskConfig;
 use magex_proto::convert::encode_result;
-use magex_proto::v1::ShardTiming;
+use magex_proto::v1::{ShardTiming, Welcome};
 use magex_runtime::client::Channel;
 use magex_runtime::sync::lock;
 use magex_runtime::trace;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, mpsc as blocking};
 use std::thread::JoinHandle;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -36,11 +36,10 @@ pub(crate) struct LeasedShard {
 
 /// How a leased shard ended.
 #[derive(Debug)]
-pub(crate) enum ShardOutcome {
-    /// The encoded result.
-    Done { lease_id: u64, result: EncodedResult },
-    /// There is no result.
-    Failed { lease_id: u64, shard: Shard, error: WorkError },
+pub(crate) struct ShardOutcome {
+    pub(crate) lease_id: u64,
+    pub(crate) shard: Shard,
+    pub(crate) result: Result<EncodedResult, WorkError>,
 }
 
 /// An encoded result, ready to be sent.
@@ -68,10 +67,11 @@ pub(crate) struct PoolContext {
 /// Threads that work on one run until the pool is shut down.
 pub(crate) struct RolloutPool {
     pub(crate) welcome: Welcome,
+    /// An actor that sends nothing for this time loses its leases.
+    pub(crate) lease: Duration,
     shards: Option<blocking::SyncSender<LeasedShard>>,
     outcomes: mpsc::Receiver<ShardOutcome>,
     cancelled: CancellationToken,
-    cache: Arc<WeightsCache>,
     metrics: Arc<ActorMetrics>,
     threads: Vec<JoinHandle<()>>,
     /// Shards submitted whose outcome has not been taken.
@@ -80,21 +80,25 @@ pub(crate) struct RolloutPool {
 
 impl RolloutPool {
     /// Makes the workers and starts a thread for each. Blocks while workers are made.
-    pub(crate) fn start(welcome: Welcome, threads: usize, context: PoolContext) -> Result<Self, WorkError> {
+    pub(crate) fn start(
+        welcome: Welcome,
+        lease: Duration,
+        threads: usize,
+        context: PoolContext,
+    ) -> Result<Self, WorkError> {
         let (shards, queue) = blocking::sync_channel(2 * threads);
         let (results, outcomes) = mpsc::channel(threads);
-        let queue = Arc::new(Mutex::new(queue));
-        let cancelled = CancellationToken::new();
-        let (cache, metrics) = (context.cache.clone(), context.metrics.clone());
+        let (shards, queue) = (Some(shards), Arc::new(Mutex::new(queue)));
+        let (cancelled, metrics) = (CancellationToken::new(), context.metrics.clone());
         // Used to count steps only; the workers parse the configuration themselves and report its errors.
         let task = RunConfig::from_toml(&welcome.run_config_toml).ok().map(|config| config.task);
         metrics.threads.set(threads as f64);
-        let mut pool =
-            Self { welcome, shards: Some(shards), outcomes, cancelled, cache, metrics, threads: Vec::new(), busy: 0 };
+        let mut pool = Self { welcome, lease, shards, outcomes, cancelled, metrics, threads: Vec::new(), busy: 0 };
         for number in 0..threads {
             let rollout = RolloutThread {
                 worker: (context.make_worker)(&pool.welcome)?,
                 welcome: pool.welcome.clone(),
+                lease,
                 context: context.clone(),
                 task: task.clone(),
                 cancelled: pool.cancelled.clone(),
@@ -162,7 +166,6 @@ impl Drop for RolloutPool {
     fn drop(&mut self) {
         self.cancelled.cancel();
         self.shards = None;
-        self.cache.wake();
     }
 }
 
@@ -170,6 +173,7 @@ impl Drop for RolloutPool {
 struct RolloutThread {
     worker: Box<dyn Worker>,
     welcome: Welcome,
+    lease: Duration,
     context: PoolContext,
     task: Option<TaskConfig>,
     cancelled: CancellationToken,
@@ -184,10 +188,8 @@ impl RolloutThread {
             if self.cancelled.is_cancelled() {
                 return;
             }
-            let outcome = match self.roll_out(&leased) {
-                Ok(result) => ShardOutcome::Done { lease_id: leased.lease_id, result },
-                Err(error) => ShardOutcome::Failed { lease_id: leased.lease_id, shard: leased.shard, error },
-            };
+            let result = self.roll_out(&leased);
+            let outcome = ShardOutcome { lease_id: leased.lease_id, shard: leased.shard, result };
             if results.blocking_send(outcome).is_err() {
                 return;
             }
@@ -198,17 +200,18 @@ impl RolloutThread {
     fn roll_out(&mut self, leased: &LeasedShard) -> Result<EncodedResult, WorkError> {
         let begun = Instant::now();
         let span = tracing::info_span!(target: trace::TARGET, parent: &leased.span, "weights wait");
-        let run_id = self.welcome.run_id.clone();
-        let key = WeightsKey { run_id, version: leased.shard.version, sha256: leased.weights_sha256.clone() };
-        let weights = self.context.cache.wait(&key, self.welcome.lease, &self.cancelled).map_err(|error| {
-            let retryable = matches!(error, CacheError::TimedOut { .. } | CacheError::Cancelled);
-            WorkError::Failed { reason: error.to_string(), retryable }
-        })?;
+        let run_id = RunId(self.welcome.run_id.clone());
+        let sha256 = leased.weights_sha256.clone();
+        let key = WeightsKey { run_id: run_id.clone(), version: leased.shard.version, sha256 };
+        let (runtime, commander) = (self.context.runtime.clone(), self.context.commander.clone());
+        let arrival = self.context.cache.wait(&key, self.lease);
+        let arrived = runtime.block_on(self.cancelled.run_until_cancelled(arrival));
+        let cancelled = || WorkError::Retryable(GoalError::Cancelled.to_string());
+        let weights = arrived.ok_or_else(cancelled)?.map_err(|late| WorkError::Retryable(late.to_string()))?;
         drop(span);
         let weights_wait_seconds = begun.elapsed().as_secs_f64();
-        let (runtime, commander) = (self.context.runtime.clone(), self.context.commander.clone());
-        let mut goals = GrpcGoals::new(runtime, commander, key, self.welcome.lease, self.cancelled.clone());
-        goals.trace(&leased.span);
+        let (cancelled, span) = (self.cancelled.clone(), leased.span.clone());
+        let mut goals = GrpcGoals::new(runtime, commander, key, self.lease, cancelled, span);
         let working = Instant::now();
         let worker = &mut self.worker;
         let result = match catch_unwind(AssertUnwindSafe(|| worker.work(&leased.shard, &weights, &mut goals))) {
@@ -224,7 +227,7 @@ impl RolloutThread {
         }
         let worked = working.elapsed().as_secs_f64();
         let goals_wait_seconds = goals.waited().as_secs_f64();
-        let bytes = encode_result(&self.welcome.run_id, &leased.weights_sha256, &result);
+        let bytes = encode_result(&run_id, &leased.weights_sha256, &result);
         let timing = ShardTiming {
             held_seconds: leased.received.elapsed().as_secs_f64(),
             weights_wait_seconds,

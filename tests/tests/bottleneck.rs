@@ -1,7 +1,7 @@
 //! Each part of the cluster is slowed down in turn, and the reported bottleneck follows.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_actor::goal_client::GoalSource;
+use magex_actor::goal_client::GrpcGoals;
 use magex_actor::policy_worker::PolicyWorker;
 use magex_actor::run::ActorConfig;
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
@@ -58,7 +58,7 @@ struct Late {
 }
 
 impl Worker for Late {
-    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         std::thread::sleep(self.delay);
         self.worker.work(shard, weights, goals)
     }
@@ -105,7 +105,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
             client: Default::default(),
             stay: false,
         };
-        tokio::spawn(magex_actor::run::run(actor, late(delay), stop.clone()));
+        tokio::spawn(magex_actor::run::run(actor, late(delay), Arc::default(), stop.clone()));
     });
     trainer.run(&mut collector).unwrap();
     stop.cancel();

@@ -91,7 +91,7 @@ impl std::fmt::Display for Table {
 
 /// 12345.6 → `12,346`; at least zero.
 pub fn thousands(value: f64) -> String {
-    indicatif::HumanCount(value.round() as u64).to_string()
+    indicatif::HumanCount(value.round_ties_even() as u64).to_string()
 }
 
 /// A span of time.

@@ -116,7 +116,7 @@ impl Worker for Flaky {
         &mut self,
         shard: &Shard,
         weights: &Weights,
-        _: &mut dyn magex_actor::goal_client::GoalSource,
+        _: &mut magex_actor::goal_client::GrpcGoals,
     ) -> Result<ShardResult, WorkError> {
         let ShardResult::Train(mut trajectory) = result_of(&task(), shard, &weights.bytes) else { panic!("training") };
         if self.0.fetch_add(1, Ordering::SeqCst) % 10 == 9 {
