@@ -30,17 +30,13 @@ struct Row {
 }
 
 impl Row {
-    fn get(&self, column: &str) -> Option<f64> {
-        self.columns.get(column)?.as_f64()
-    }
-
     /// A metric under its name in metrics.jsonl.
     fn metric(&self, metric: usize) -> Option<f64> {
-        self.get(METRICS[metric].name)
+        self.columns.get(METRICS[metric].name)?.as_f64()
     }
 
     fn sampled(&self, metric: usize) -> Option<f64> {
-        self.get(METRICS[metric].sampled?)
+        self.columns.get(METRICS[metric].sampled?)?.as_f64()
     }
 }
 
@@ -69,8 +65,10 @@ pub(crate) struct Progress {
     /// The metrics that have a column.
     metrics: Vec<usize>,
     colours: bool,
-    last_iteration: Option<Instant>,
-    page: Option<String>,
+    /// Time at which the last iteration was reported.
+    pub(crate) last_iteration: Option<Instant>,
+    /// Address of the live page, if there is one.
+    pub(crate) page: Option<String>,
 }
 
 impl Progress {
@@ -79,8 +77,9 @@ impl Progress {
         let target = f64::from(config.run.target_success);
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
         let metrics = (0..METRICS.len()).filter(shown).collect();
-        let terminal = std::io::stderr().is_terminal();
-        if !terminal {
+        let mut progress =
+            Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
+        if !std::io::stderr().is_terminal() {
             tracing::info!(
                 out,
                 task = %config.task.name,
@@ -93,10 +92,10 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
+            return progress;
         }
-        let colours = colours();
-        let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
+        progress.colours = colours();
+        let [bold, plain] = if progress.colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
         note(format!("{bold}{}{plain}", crate::artifacts::describe(config)));
         note(format!("{title} · {out}\n"));
         let bar = ProgressBar::with_draw_target(Some(config.run.max_steps), ProgressDrawTarget::stderr_with_hz(10));
@@ -107,7 +106,8 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, metrics, colours, last_iteration: None, page: None }
+        progress.bar = Some(bar);
+        progress
     }
 
     /// Shows an event of the run.
@@ -126,11 +126,6 @@ impl Progress {
         }
     }
 
-    /// Time at which the last iteration was reported.
-    pub(crate) fn last_iteration(&self) -> Option<Instant> {
-        self.last_iteration
-    }
-
     /// Shows the address of the live page.
     pub(crate) fn page(&mut self, address: &str) {
         let url = format!("http://{address}/");
@@ -139,11 +134,6 @@ impl Progress {
             None => tracing::info!(url, "live page"),
         }
         self.page = Some(url);
-    }
-
-    /// Address of the live page, if there was one.
-    pub(crate) fn page_url(&self) -> Option<&str> {
-        self.page.as_deref()
     }
 
     /// Sets the text of the status line.

@@ -2,6 +2,7 @@
 
 use crate::serve::ledger::SessionId;
 use crate::serve::lock_order::{OrderedMutex, Rank};
+use crate::serve::metrics::LearnerMetrics;
 use magex_core::ids::WeightsVersion;
 use magex_proto::v1;
 use magex_runtime::status;
@@ -40,16 +41,6 @@ impl ActorEntry {
     fn queued_messages(&self) -> usize {
         self.outbound.upgrade().map_or(0, |queue| queue.max_capacity() - queue.capacity())
     }
-}
-
-/// Totals for the metrics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct RosterCounts {
-    pub(crate) connected: usize,
-    pub(crate) missing: usize,
-    pub(crate) threads: usize,
-    /// Messages that wait to be sent.
-    pub(crate) queued_messages: usize,
 }
 
 #[derive(Debug, Default)]
@@ -128,18 +119,10 @@ impl Roster {
         }
     }
 
-    /// Records when a message of this session arrived.
-    pub(crate) fn mark_seen(&self, session: SessionId, at: Instant) {
+    /// Changes the entry of a session, unless it has ended.
+    pub(crate) fn update(&self, session: SessionId, change: impl FnOnce(&mut ActorEntry)) {
         if let Some(actor) = self.members.lock().connected.get_mut(&session) {
-            actor.last_seen = at;
-        }
-    }
-
-    /// Records a result of this session that the batch accepted.
-    pub(crate) fn mark_shard_done(&self, session: SessionId, version: WeightsVersion) {
-        if let Some(actor) = self.members.lock().connected.get_mut(&session) {
-            actor.shards_done += 1;
-            actor.weights_version = Some(version);
+            change(actor);
         }
     }
 
@@ -172,16 +155,14 @@ impl Roster {
         self.members.lock().connected.iter().map(|(id, actor)| (*id, actor.clone())).collect()
     }
 
-    /// Forgets actors that have been missing for too long, and counts.
-    pub(crate) fn counts(&self) -> RosterCounts {
+    /// Forgets actors that have been missing for too long, and sets the gauges of the others.
+    pub(crate) fn refresh(&self, metrics: &LearnerMetrics) {
         let mut members = self.members.lock();
         members.missing.retain(|_, since| since.elapsed() < MISSING_TIME);
-        let sum = |f: fn(&ActorEntry) -> usize| members.connected.values().map(f).sum();
-        RosterCounts {
-            connected: members.connected.len(),
-            missing: members.missing.len(),
-            threads: sum(|actor| actor.threads as usize),
-            queued_messages: sum(ActorEntry::queued_messages),
-        }
+        let connected = members.connected.len();
+        metrics.actors_live.set(connected as f64);
+        metrics.actors_expected.set((connected + members.missing.len()) as f64);
+        metrics.actor_threads.set(members.connected.values().map(|actor| f64::from(actor.threads)).sum());
+        metrics.queue("actors", members.connected.values().map(ActorEntry::queued_messages).sum());
     }
 }

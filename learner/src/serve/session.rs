@@ -211,7 +211,7 @@ impl Session {
 
     fn mark_seen(&mut self) {
         self.last_seen = Instant::now();
-        self.shared.roster.mark_seen(self.id, self.last_seen);
+        self.shared.roster.update(self.id, |actor| actor.last_seen = self.last_seen);
     }
 
     /// Sends a message. An actor that reads nothing for the time of a lease counts as silent.

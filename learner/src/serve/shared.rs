@@ -14,14 +14,13 @@
 //! Two changes end the training thread's wait although they are not in the ledger: the last actor leaves, and a stop is
 //! requested. Both happen within [`Work::wake_after`], under the work lock.
 
-use crate::run_events::CollectError;
-use crate::run_events::StopReason;
+use crate::run_events::{CollectError, StopReason};
 use crate::run_identity::RunIdentity;
 use crate::serve::control::Control;
 use crate::serve::events::Events;
 use crate::serve::ledger::SessionId;
 use crate::serve::metrics::LearnerMetrics;
-use crate::serve::roster::{Roster, RosterCounts};
+use crate::serve::roster::Roster;
 use crate::serve::status::RunStatusCache;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board::{Weights, WeightsBoard};
@@ -65,8 +64,8 @@ impl Shared {
             roster: Roster::new(limits.max_actors),
             control: Control::new(),
             status: RunStatusCache::new(),
-            board: WeightsBoard::new(),
-            events: Arc::new(Events::new()),
+            board: WeightsBoard::default(),
+            events: Arc::default(),
             metrics,
             registry,
             decoders: Semaphore::new(magex_runtime::process::processors()),
@@ -82,11 +81,8 @@ impl Shared {
     /// A permit for a stream of weights or events, held until the stream ends.
     pub(crate) fn watcher(&self) -> Result<OwnedSemaphorePermit, Status> {
         self.watchers.clone().try_acquire_owned().map_err(|_| {
-            let limit = self.limits.max_watchers;
-            status::resource_exhausted(
-                format!("watchers: the limit of {limit} streams is reached"),
-                Duration::from_secs(5),
-            )
+            let problem = format!("watchers: the limit of {} streams is reached", self.limits.max_watchers);
+            status::resource_exhausted(problem, Duration::from_secs(5))
         })
     }
 
@@ -127,11 +123,7 @@ impl Shared {
 
     /// Sets the gauges that are computed on demand, before a scrape.
     pub(crate) fn refresh_gauges(&self) {
-        let RosterCounts { connected, missing, threads, queued_messages } = self.roster.counts();
-        self.metrics.actors_live.set(connected as f64);
-        self.metrics.actors_expected.set((connected + missing) as f64);
-        self.metrics.actor_threads.set(threads as f64);
-        self.metrics.queue("actors", queued_messages);
+        self.roster.refresh(&self.metrics);
         self.metrics.queue("events", self.events.len());
     }
 }

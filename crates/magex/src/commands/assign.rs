@@ -5,6 +5,7 @@ use crate::options::CommonOptions;
 use crate::output::{Table, note};
 use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::client::ConnectError;
@@ -158,7 +159,10 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
             output.say(format!("  unassigned {what}: {}", list.join(", ")));
         }
     }
-    let answered = kind_name(response.scheduler());
+    let answered = match response.scheduler() {
+        v1::AssignmentMethod::Unspecified => "unknown",
+        method => AssignmentMethod::from(method).name(),
+    };
     let version = match response.sha256.is_empty() {
         true => String::new(),
         false => {
@@ -208,17 +212,6 @@ fn scheduler(kind: Kind) -> v1::AssignmentMethod {
         Kind::Greedy => v1::AssignmentMethod::Greedy,
         Kind::Random => v1::AssignmentMethod::Random,
         Kind::Makespan => v1::AssignmentMethod::Makespan,
-    }
-}
-
-fn kind_name(kind: v1::AssignmentMethod) -> &'static str {
-    match kind {
-        v1::AssignmentMethod::Learned => "learned",
-        v1::AssignmentMethod::Exact => "exact",
-        v1::AssignmentMethod::Greedy => "greedy",
-        v1::AssignmentMethod::Random => "random",
-        v1::AssignmentMethod::Makespan => "makespan",
-        v1::AssignmentMethod::Unspecified => "unknown",
     }
 }
 

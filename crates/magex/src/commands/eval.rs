@@ -13,6 +13,7 @@ use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::means::{EvalSummary, summarise};
 use magex_runtime::exit;
+use magex_runtime::process::processors;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -98,7 +99,7 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
     });
     let seeds = if args.episode_seeds.is_empty() { vec![config.run.seed] } else { args.episode_seeds.clone() };
     let spawns = layouts(config.task.spawn, args.per_layout)?;
-    let threads = args.threads.unwrap_or_else(settings::cores);
+    let threads = args.threads.unwrap_or_else(processors);
     let driver = match args.vary.controller {
         Controller::Learned => format!("executor {}", config.executor.kind),
         Controller::Scripted => "scripted controller".to_owned(),

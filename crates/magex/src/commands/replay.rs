@@ -4,9 +4,9 @@ use crate::artifacts::{describe, write_replay};
 use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
 use crate::folder;
 use crate::options::CommonOptions;
-use crate::settings;
 use magex_core::ids::Mode;
 use magex_runtime::exit;
+use magex_runtime::process::processors;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -57,7 +57,7 @@ pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<
     let mut episodes = Vec::new();
     for &mode in args.mode.list() {
         let wanted = Episodes { count: args.episodes, set: args.eval_set, mode, record: args.episodes };
-        let (metrics, recordings) = roll_out(&policy, &config, wanted, settings::cores())?;
+        let (metrics, recordings) = roll_out(&policy, &config, wanted, processors())?;
         episodes.extend(recordings.into_iter().zip(metrics.into_iter().map(Some)));
     }
     let modes: Vec<&str> = args.mode.list().iter().map(|&mode: &Mode| mode_name(mode)).collect();

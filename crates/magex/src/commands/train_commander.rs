@@ -21,6 +21,7 @@ use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, gr
 use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
 use magex_runtime::exit;
+use magex_runtime::process::processors;
 use serde_json::{Value, json};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -96,7 +97,7 @@ pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow:
     let training = Training {
         ppo: CommanderPpo::new(&config.commander, &config.task, config.run.seed),
         args: args.clone(),
-        threads: args.threads.unwrap_or_else(settings::cores),
+        threads: args.threads.unwrap_or_else(processors),
         config,
         out,
     };
