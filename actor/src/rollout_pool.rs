@@ -28,13 +28,11 @@ pub(crate) struct LeasedShard {
     pub(crate) lease_id: u64,
     pub(crate) shard: Shard,
     pub(crate) weights_sha256: String,
-    /// When the lease arrived.
     pub(crate) received: Instant,
     /// From the lease until the learner acknowledges the result.
     pub(crate) span: Span,
 }
 
-/// How a leased shard ended.
 #[derive(Debug)]
 pub(crate) struct ShardOutcome {
     pub(crate) lease_id: u64,
@@ -42,19 +40,16 @@ pub(crate) struct ShardOutcome {
     pub(crate) result: Result<EncodedResult, WorkError>,
 }
 
-/// An encoded result, ready to be sent.
 #[derive(Debug, Clone)]
 pub(crate) struct EncodedResult {
     pub(crate) bytes: Bytes,
     /// Where the time went; sent beside the result, never part of it.
     pub(crate) timing: ShardTiming,
-    /// When it was ready.
     pub(crate) ready: Instant,
     /// From then until the acknowledgement; ends when this is dropped.
     pub(crate) _upload: Span,
 }
 
-/// What all threads of a pool share.
 #[derive(Clone)]
 pub(crate) struct PoolContext {
     pub(crate) make_worker: MakeWorker,
@@ -113,12 +108,10 @@ impl RolloutPool {
         Ok(pool)
     }
 
-    /// Rollout threads.
     pub(crate) fn threads(&self) -> usize {
         self.threads.len()
     }
 
-    /// Threads without a shard.
     pub(crate) fn idle(&self) -> usize {
         self.threads.len().saturating_sub(self.busy)
     }
@@ -169,7 +162,6 @@ impl Drop for RolloutPool {
     }
 }
 
-/// What one thread of the pool owns.
 struct RolloutThread {
     worker: Box<dyn Worker>,
     welcome: Welcome,

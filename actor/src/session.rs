@@ -17,7 +17,6 @@ use tonic::{Status, Streaming};
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 const LONGEST_LEASE: Duration = Duration::from_secs(3600);
 
-/// How a connection ends.
 #[derive(Debug)]
 pub(crate) enum SessionEnd {
     /// The actor shuts down.
@@ -95,7 +94,6 @@ fn lease_time(seconds: f64) -> Result<Duration, SessionEnd> {
     })
 }
 
-/// A connection after its welcome.
 pub(crate) struct Session<'a> {
     pub(crate) pool: &'a mut RolloutPool,
     pub(crate) unacknowledged: &'a mut UnacknowledgedResults,
@@ -124,7 +122,6 @@ impl<'a> Session<'a> {
         Self { pool, unacknowledged, report, metrics, outbound, urgent, bulk, credit: 0, fatal: None }
     }
 
-    /// Runs until the connection ends.
     pub(crate) async fn run(
         mut self,
         mut inbound: Streaming<v1::RolloutResponse>,

@@ -7,10 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// Number of versions held.
 const KEPT: usize = 2;
 
-/// The weights did not arrive in time.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("weights version {wanted} did not arrive within {waited:?}; here are versions {held:?}")]
 pub(crate) struct WeightsLate {

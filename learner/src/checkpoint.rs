@@ -70,7 +70,6 @@ fn in_file<R: ToString>(path: &Path) -> impl FnOnce(R) -> CheckpointError + use<
     move |reason| CheckpointError::File { path: path.to_owned(), reason: reason.to_string() }
 }
 
-/// The release that writes a format.
 fn writer(format: u32) -> &'static str {
     match format {
         FIRST_FORMAT => "magex 0.1.0 (commit 389f705)",
@@ -103,7 +102,6 @@ struct State {
     format: u32,
     progress: Progress,
     value_norm: ValueNorm,
-    /// Updates of each network's optimiser.
     adam_steps: BTreeMap<String, u64>,
 }
 
@@ -121,7 +119,6 @@ fn moments(learned: &Learned) -> Result<Vec<u8>, ParamError> {
     to_safetensors(&named, "{\"format\":1}")
 }
 
-/// What every format has in common.
 #[derive(Deserialize)]
 struct Format {
     format: u32,

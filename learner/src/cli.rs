@@ -174,7 +174,6 @@ async fn train(
     }
 }
 
-/// Logs how all leases ended.
 fn log_ledger(status: &v1::RunStatus) {
     for (counted, totals) in [("shards", &status.ledger), ("episodes", &status.episodes)] {
         let Some(b) = totals else { continue };

@@ -75,7 +75,6 @@ pub enum CollectError {
     RolloutThread,
 }
 
-/// The name of a shard in messages.
 pub(crate) fn describe(shard: &Shard) -> String {
     format!("{:?} shard {} of iteration {}", shard.kind, shard.index, shard.iteration).to_lowercase()
 }

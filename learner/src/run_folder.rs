@@ -4,7 +4,6 @@ use crate::checkpoint;
 use std::fs;
 use std::path::Path;
 
-/// Name of the effective configuration in a run folder.
 pub(crate) const CONFIG_FILE: &str = "config.toml";
 
 /// What a run folder contains.

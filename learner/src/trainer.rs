@@ -53,7 +53,6 @@ pub struct Trainer {
     pool: Arc<rayon::ThreadPool>,
     /// The summary of a run that was complete when it was opened, parsed and as it is on disk.
     complete: Option<(Summary, String)>,
-    /// The last iteration of an earlier process.
     before: Option<IterationEvent>,
     /// Checkpoints that could not be written, in a row.
     failed_checkpoints: u32,
@@ -267,7 +266,6 @@ impl Trainer {
         }
     }
 
-    /// Updates the executor and the commander with the iteration's trajectories.
     fn update(
         &mut self,
         trajectories: &[Trajectory],
@@ -291,7 +289,6 @@ impl Trainer {
         Ok((stats, commander))
     }
 
-    /// Reports an iteration to all observers.
     fn record(
         &mut self,
         collector: &dyn Collector,
@@ -325,7 +322,6 @@ impl Trainer {
         Ok(())
     }
 
-    /// Seconds of training so far, over all processes of the run.
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }

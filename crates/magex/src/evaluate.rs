@@ -14,7 +14,6 @@ use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
 pub(crate) const EVAL_SET: u32 = 100;
 /// Limit of agents per shard, unless a single episode has more: bounds the memory of a rollout.
 const AGENTS_PER_SHARD: usize = 800;
-/// Limit of episodes per shard.
 const EPISODES_PER_SHARD: u32 = 16;
 
 /// What chooses the actions.
@@ -27,7 +26,6 @@ pub(crate) enum Controller {
     Scripted,
 }
 
-/// How actions and goals are chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Modes {
     /// The most likely action, goal and edges.
@@ -39,7 +37,6 @@ pub(crate) enum Modes {
 }
 
 impl Modes {
-    /// The modes, greedy first.
     pub(crate) fn list(self) -> &'static [Mode] {
         match self {
             Self::Greedy => &[Mode::Greedy],
@@ -49,7 +46,6 @@ impl Modes {
     }
 }
 
-/// The name of a mode.
 pub(crate) fn mode_name(mode: Mode) -> &'static str {
     match mode {
         Mode::Greedy => "greedy",
@@ -110,7 +106,6 @@ impl Variation {
         Ok(config.validated()?)
     }
 
-    /// The policy to evaluate.
     pub(crate) fn policy(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<LoadedPolicy> {
         let roller = match self.controller {
             Controller::Learned => Roller::new(config, weights)?,
@@ -120,20 +115,15 @@ impl Variation {
         Ok(LoadedPolicy { roller, commander, random_assignment_fraction: 0.0 })
     }
 
-    /// The scheduler that assigns the goals.
     pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderPolicy {
         self.scheduler.unwrap_or(config.commander.kind)
     }
 }
 
-/// Which episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Episodes {
-    /// How many.
     pub(crate) count: u32,
-    /// Evaluation set.
     pub(crate) set: u32,
-    /// How actions and goals are chosen.
     pub(crate) mode: Mode,
     /// Number of episodes to record, from the first.
     pub(crate) record: u32,

@@ -21,7 +21,6 @@ use std::path::{Path, PathBuf};
 
 /// The effective configuration.
 pub const CONFIG: &str = "config.toml";
-/// The result of a finished run.
 pub(crate) const SUMMARY: &str = "summary.json";
 /// The trained networks.
 pub const WEIGHTS: &str = "weights.safetensors";

@@ -23,7 +23,6 @@ pub(crate) struct LoadedPolicy {
 }
 
 impl LoadedPolicy {
-    /// Loads executor and commander from a weights file.
     fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         Ok(Self {
             roller: Roller::new(config, weights)?,
@@ -32,7 +31,6 @@ impl LoadedPolicy {
         })
     }
 
-    /// Rolls out one shard.
     fn rollout(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
         self.roller
             .rollout(shard, |request| answer(&self.commander, self.random_assignment_fraction, request, &|| true))
@@ -49,7 +47,7 @@ impl LoadedPolicy {
 }
 
 /// The configured commander with its weights, or the classical one that `scheduler` names.
-pub(crate) fn commander(
+pub fn commander(
     config: &RunConfig,
     weights: &[u8],
     scheduler: Option<CommanderPolicy>,

@@ -7,7 +7,6 @@ use std::io::{IsTerminal as _, Write};
 use std::sync::Mutex;
 use tracing_subscriber::EnvFilter;
 
-/// The status line on the screen.
 static LIVE: Mutex<Option<ProgressBar>> = Mutex::new(None);
 
 /// Sets or removes the status line.

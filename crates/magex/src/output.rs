@@ -43,7 +43,6 @@ pub fn note(text: impl AsRef<str>) {
     });
 }
 
-/// Whether standard error shows colours.
 pub(crate) fn colours() -> bool {
     std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none()
 }

@@ -13,7 +13,6 @@ use serde_json::Value;
 use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};
 
-/// Rows between two headings of the table.
 const PAGE: u32 = 40;
 
 /// The part of a line of metrics.jsonl that is shown.
@@ -57,12 +56,10 @@ impl Shares {
     }
 }
 
-/// Shows the progress of a run.
 pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     rows: u32,
     target: f64,
-    /// The metrics that have a column.
     metrics: Vec<usize>,
     colours: bool,
     /// Time at which the last iteration was reported.
@@ -72,7 +69,6 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
@@ -110,7 +106,6 @@ impl Progress {
         progress
     }
 
-    /// Shows an event of the run.
     pub(crate) fn event(&mut self, event: &RunEvent) {
         match event {
             RunEvent::Iteration(report) => match serde_json::from_str::<Row>(&report.metrics_json) {
@@ -126,7 +121,6 @@ impl Progress {
         }
     }
 
-    /// Shows the address of the live page.
     pub(crate) fn page(&mut self, address: &str) {
         let url = format!("http://{address}/");
         match &self.bar {
@@ -136,14 +130,12 @@ impl Progress {
         self.page = Some(url);
     }
 
-    /// Sets the text of the status line.
     pub(crate) fn status(&self, text: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(text.to_owned());
         }
     }
 
-    /// Removes the status line.
     pub(crate) fn end(&mut self) {
         set_live_line(None);
         if let Some(bar) = self.bar.take() {
@@ -198,7 +190,6 @@ impl Drop for Progress {
     }
 }
 
-/// Width of a metric's column.
 fn width(metric: usize) -> usize {
     METRICS[metric].label.len().max(6)
 }

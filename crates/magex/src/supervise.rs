@@ -22,7 +22,6 @@ use tokio_util::sync::CancellationToken;
 /// The learner may die this often without completing an iteration in between.
 const LIVES: u32 = 4;
 
-/// How a training run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TrainEnd {
     /// Target reached or budget spent; summary.json exists.
@@ -31,7 +30,6 @@ pub(crate) enum TrainEnd {
     Stopped,
 }
 
-/// Actor processes and their threads.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ActorPlan {
     pub(crate) actors: usize,
@@ -44,7 +42,6 @@ pub(crate) struct ActorPlan {
 pub(crate) struct ServicesPlan<'a> {
     /// Run folder with a checkpoint.
     pub(crate) folder: &'a Path,
-    /// Training threads of the learner.
     pub(crate) threads: usize,
     /// Address of the live page, if there is one.
     pub(crate) http: Option<&'a str>,

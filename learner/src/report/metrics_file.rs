@@ -17,7 +17,6 @@ const MAX_WAITING: usize = 4096;
 #[derive(Debug)]
 pub(crate) struct MetricsFile {
     path: PathBuf,
-    /// Opened for appending.
     file: File,
     /// Bytes of whole lines.
     length: u64,
@@ -25,7 +24,6 @@ pub(crate) struct MetricsFile {
 }
 
 impl MetricsFile {
-    /// An empty file.
     pub(crate) fn create(folder: &Path) -> Result<Self, FileError> {
         let path = folder.join("metrics.jsonl");
         File::create(&path).map_err(|error| FileError { path: path.clone(), error })?;
@@ -58,7 +56,6 @@ impl MetricsFile {
         Self::open(path)
     }
 
-    /// The last line of a run folder's file, if it has one.
     pub(crate) fn last_line(folder: &Path) -> Option<String> {
         let text = std::fs::read_to_string(folder.join("metrics.jsonl")).ok()?;
         text.lines().next_back().map(str::to_owned)

@@ -25,7 +25,6 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// With its bottleneck.
     pub(crate) fn attributed(self, collected: Option<&CollectTiming>) -> Self {
         let learner_s = self.publish_s + self.executor_s + self.commander_s + self.checkpoint_s;
         Self { bottleneck: attribute(learner_s, self.collect_s, collected), ..self }

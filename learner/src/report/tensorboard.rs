@@ -16,10 +16,8 @@ use std::io::{Error, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Folder of the event files in a run folder.
 const FOLDER: &str = "tensorboard";
 
-/// What the names of the files begin with.
 const PREFIX: &str = "events.out.tfevents.";
 
 /// The part of tensorflow.Event that is written.

@@ -47,7 +47,6 @@ impl Events {
         });
     }
 
-    /// Number of events kept.
     pub(crate) fn len(&self) -> usize {
         self.0.borrow().events.len()
     }

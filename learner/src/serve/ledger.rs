@@ -16,7 +16,6 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 /// Permanent (not retryable) failures before a shard is given up or an actor is evicted.
 pub(crate) const MAX_FAILURES: u32 = 3;
 
-/// One connection of one actor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct SessionId(pub(crate) u64);
 
@@ -24,7 +23,6 @@ pub(crate) struct SessionId(pub(crate) u64);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct LeaseId(pub(crate) u64);
 
-/// A leased shard.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Lease {
     pub(crate) id: LeaseId,
@@ -34,11 +32,9 @@ pub(crate) struct Lease {
 /// The verdict on a result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// Taken into the batch.
     Accepted,
     /// The shard is complete already, or belongs to no open plan.
     Duplicate,
-    /// The result is invalid.
     Rejected(FieldError),
 }
 
@@ -81,7 +77,6 @@ fn balanced(totals: Counters, outstanding: u64) -> Counters {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct GivenUp {
     pub(crate) shard: Shard,
-    /// The reason of the last failure.
     pub(crate) reason: String,
 }
 
@@ -127,7 +122,6 @@ struct HeldLease {
     shard: Shard,
 }
 
-/// The state machine. See the module's documentation.
 #[derive(Debug, Default)]
 pub(crate) struct Ledger {
     next_lease: u64,
@@ -169,7 +163,6 @@ impl Ledger {
         Ok(())
     }
 
-    /// Leases the next queued shard, if there is one.
     pub(crate) fn lease(&mut self, session: SessionId) -> Option<Lease> {
         loop {
             let at = self.queue.pop_front()?;
@@ -276,7 +269,6 @@ impl Ledger {
         self.close();
     }
 
-    /// All shards of the open plan are done.
     pub(crate) fn is_complete(&self) -> bool {
         !self.plan.is_empty() && self.done == self.plan.len()
     }
@@ -286,22 +278,18 @@ impl Ledger {
         (self.done, self.plan.len())
     }
 
-    /// Shards that wait to be leased.
     pub(crate) fn queued(&self) -> usize {
         self.queue.len()
     }
 
-    /// The shards of the open plan.
     pub(crate) fn plan(&self) -> impl Iterator<Item = &Shard> {
         self.plan.iter().map(|slot| &slot.shard)
     }
 
-    /// The shard that no actor can do, if there is one.
     pub(crate) fn given_up(&self) -> Option<&GivenUp> {
         self.given_up.as_ref()
     }
 
-    /// Leases that an actor holds.
     pub(crate) fn leases_of(&self, session: SessionId) -> usize {
         self.held.values().filter(|held| held.session == session).count()
     }

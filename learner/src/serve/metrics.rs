@@ -11,7 +11,6 @@ use magex_runtime::metrics::{
 };
 use std::time::Duration;
 
-/// The metrics of the learner.
 #[derive(Debug)]
 pub(crate) struct LearnerMetrics {
     shards: LeaseMetrics,
@@ -48,7 +47,6 @@ pub(crate) const ENDS: [&str; 5] = ["left", "silent", "replaced", "closing", "re
 const PHASES: [&str; 5] = ["publish", "collect", "executor", "commander", "checkpoint"];
 
 impl LearnerMetrics {
-    /// Declares all of them.
     pub(crate) fn new(m: &Metrics) -> Self {
         let metrics = Self {
             shards: LeaseMetrics::new(m, "shards", "Shards"),
@@ -141,19 +139,16 @@ impl LearnerMetrics {
         GaugeGuard::new(self.subscribers.with_label_values(&[role_name(role)]))
     }
 
-    /// Counts the joint steps and agent steps of an accepted result.
     pub(crate) fn accepted(&self, (joint, agent): (u64, u64)) {
         self.joint_steps.inc_by(joint);
         self.agent_steps.inc_by(agent);
     }
 
-    /// The batch is complete.
     pub(crate) fn batch(&self, lags: &[f64], ages: &[f64]) {
         set_stats(&self.policy_lag, lags);
         set_stats(&self.sample_age, ages);
     }
 
-    /// An iteration is complete.
     pub(crate) fn iteration(&self, metrics: &IterationMetrics) {
         let timing = &metrics.timing;
         self.iterations.inc_by(u64::from(metrics.executor.is_some()));

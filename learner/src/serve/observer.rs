@@ -58,7 +58,6 @@ impl RunObserver for ServiceObserver {
     }
 }
 
-/// Bytes of the files in a folder.
 fn size_of(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
     entries.filter_map(|entry| entry.metadata().ok()).map(|meta| meta.len()).sum()

@@ -15,9 +15,7 @@ use tonic::Status;
 
 /// A missing actor counts as expected for this time.
 const MISSING_TIME: Duration = Duration::from_secs(600);
-/// Limit of missing actors that are remembered.
 const MAX_MISSING: usize = 1024;
-/// Limit of evicted processes that are remembered.
 const MAX_EVICTED: usize = 1024;
 
 /// One session, as the rest of the service sees it.
@@ -28,12 +26,10 @@ pub(crate) struct ActorEntry {
     pub(crate) address: String,
     pub(crate) threads: u32,
     pub(crate) shards_done: u64,
-    /// Version of the latest result.
     pub(crate) weights_version: Option<WeightsVersion>,
     pub(crate) last_seen: Instant,
     /// Ends the session: the same process has connected again.
     pub(crate) replaced: CancellationToken,
-    /// Queue of outgoing messages.
     pub(crate) outbound: WeakSender<Result<v1::RolloutResponse, Status>>,
 }
 
@@ -66,7 +62,6 @@ impl Members {
     }
 }
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Roster {
     members: OrderedMutex<Members>,
@@ -131,7 +126,6 @@ impl Roster {
         self.members.lock().processes().collect()
     }
 
-    /// Bars a process from further sessions.
     pub(crate) fn evict(&self, process_id: u64) {
         self.members.lock().evict(process_id);
     }

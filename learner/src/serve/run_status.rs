@@ -6,7 +6,6 @@ use magex_core::ids::ShardKind;
 use magex_proto::v1;
 
 impl Shared {
-    /// The status of the run.
     pub(crate) fn run_status(&self) -> v1::RunStatus {
         let latest = self.board.latest();
         let sessions = self.roster.sessions();

@@ -31,7 +31,6 @@ use tonic::{Request, Response, Status, Streaming};
 /// Default time of a lease.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
 
-/// Streaming methods.
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
 /// Limits in flight, per caller and in total. All actors of a run may be one caller.
@@ -140,7 +139,6 @@ impl LearnerHandle {
     }
 }
 
-/// The methods of the service, on top of the shared state.
 #[derive(Debug)]
 struct LearnerApi {
     shared: Arc<Shared>,

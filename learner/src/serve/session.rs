@@ -20,13 +20,11 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 use tracing::Span;
 
-/// Messages to an actor.
 pub(crate) type Outbound = mpsc::Sender<Result<v1::RolloutResponse, Status>>;
 
 /// Limit of the leases that an actor may hold, and of its credit for more.
 const MAX_LEASES: usize = 1024;
 
-/// Why a session ends.
 #[derive(Debug)]
 enum SessionEnd {
     /// The actor or the network closed the connection.
@@ -65,7 +63,6 @@ pub(crate) async fn run(
     }
 }
 
-/// A lease that this session granted.
 struct GrantedLease {
     since: Instant,
     /// From the grant to the verdict on its result.
@@ -85,11 +82,9 @@ struct Session {
     assembling: Option<LeaseId>,
     /// Leases without a result.
     granted: HashMap<LeaseId, GrantedLease>,
-    /// Invalid results.
     rejected: u32,
     /// Shards that failed for good, in a row.
     failed: u32,
-    /// Results that arrived damaged.
     damaged: u32,
     last_seen: Instant,
 }
@@ -224,7 +219,6 @@ impl Session {
         }
     }
 
-    /// Grants leases while there are shards and credit.
     async fn grant_leases(&mut self) -> Result<(), SessionEnd> {
         while self.credit > 0 && self.granted.len() < MAX_LEASES {
             let Some(lease) = self.shared.work.with_ledger(|ledger| ledger.lease(self.id)) else { break };

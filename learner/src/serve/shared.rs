@@ -32,7 +32,6 @@ use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) run: RunIdentity,
@@ -48,7 +47,6 @@ pub(crate) struct Shared {
     pub(crate) registry: Arc<Metrics>,
     /// One permit per processor: more concurrent decoders would only hold memory.
     pub(crate) decoders: Semaphore,
-    /// One permit per stream of weights or events.
     watchers: Arc<Semaphore>,
 }
 
@@ -113,7 +111,6 @@ impl Shared {
         lost
     }
 
-    /// Makes weights the latest version.
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
         self.metrics.weights_version.set(f64::from(weights.version.0));
         self.metrics.weights_bytes.set(weights.bytes.len() as f64);
@@ -121,7 +118,6 @@ impl Shared {
         self.board.publish(weights);
     }
 
-    /// Sets the gauges that are computed on demand, before a scrape.
     pub(crate) fn refresh_gauges(&self) {
         self.roster.refresh(&self.metrics);
         self.metrics.queue("events", self.events.len());

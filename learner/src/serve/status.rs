@@ -5,7 +5,6 @@ use magex_core::ids::WeightsVersion;
 use magex_proto::v1;
 use std::time::Instant;
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct RunStatusCache {
     /// Only fields that the training thread knows are set.

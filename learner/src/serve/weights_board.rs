@@ -50,13 +50,11 @@ impl WeightsBoard {
         self.kept.borrow().last().cloned()
     }
 
-    /// Returns once there is a version.
     pub(crate) async fn first(&self) {
         // This struct owns the sender, so the wait cannot fail.
         let _ = self.kept.subscribe().wait_for(|kept| !kept.is_empty()).await.map(drop);
     }
 
-    /// Whether a version is kept.
     pub(crate) fn is_kept(&self, version: WeightsVersion) -> bool {
         self.kept.borrow().iter().any(|weights| weights.version == version)
     }
@@ -65,7 +63,6 @@ impl WeightsBoard {
         lock(&self.published).get(&version).map(|published| published.0.clone())
     }
 
-    /// When a version was published.
     pub(crate) fn since(&self, version: WeightsVersion) -> Option<Instant> {
         lock(&self.published).get(&version).map(|published| published.1)
     }

@@ -15,16 +15,13 @@ use std::time::Instant;
 use tokio::sync::watch;
 use tracing::Span;
 
-/// What the work lock protects.
 #[derive(Debug)]
 pub(crate) struct OpenWork {
     pub(crate) ledger: Ledger,
     pub(crate) timing: ShardTiming,
-    /// Span of the iteration that is being collected.
     trace: Span,
 }
 
-/// A collected plan.
 #[derive(Debug)]
 pub(crate) struct CollectedPlan {
     /// In the order of the plan.
@@ -34,7 +31,6 @@ pub(crate) struct CollectedPlan {
     pub(crate) ages: Vec<f64>,
 }
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Work {
     open: OrderedMutex<OpenWork>,
@@ -77,12 +73,10 @@ impl Work {
         value
     }
 
-    /// [`Self::update`] of the ledger alone.
     pub(crate) fn with_ledger<T>(&self, change: impl FnOnce(&mut Ledger) -> T) -> T {
         self.update(|open| change(&mut open.ledger))
     }
 
-    /// Reads the ledger.
     pub(crate) fn inspect<T>(&self, read: impl FnOnce(&Ledger) -> T) -> T {
         read(&self.open.lock().ledger)
     }

@@ -25,7 +25,6 @@ use magex_nets::params::{ParamBuilder, ParamError};
 
 pub use imitation::Lesson;
 
-/// Name of the scheduler's network.
 const NAME: &str = "commander";
 
 /// One team and what was decided for it.

@@ -78,7 +78,6 @@ fn renamed(_: &str) -> Result<String, String> {
     Err("this option is now called --episode-seeds".into())
 }
 
-/// One line of the table.
 struct Row {
     seed: u64,
     mode: Mode,
@@ -171,7 +170,6 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
     Ok(exit::OK)
 }
 
-/// The spawn modes of the rows.
 fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
     match spawn {
         _ if !each => Ok(vec![spawn]),

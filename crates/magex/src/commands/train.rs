@@ -157,7 +157,6 @@ struct Plan {
     http: Option<String>,
     /// The actor processes; `None` to train in this process.
     actors: Option<ActorPlan>,
-    /// How it is trained, for display.
     title: String,
 }
 

@@ -77,7 +77,6 @@ const VALIDATION: u32 = 5;
 const VALIDATION_SIZES: [usize; 5] = [5, 20, 50, 100, 200];
 const VALIDATION_INSTANCES: u32 = 32;
 
-/// Lines of metrics.jsonl.
 const MEASUREMENTS: u32 = 20;
 
 pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow::Result<u8> {

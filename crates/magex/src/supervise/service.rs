@@ -44,7 +44,6 @@ pub struct Running {
     log_start: u64,
     /// Address it listens on; empty if it does not listen.
     pub address: String,
-    /// Address of its HTTP page, if it has one.
     pub(crate) http: Option<String>,
 }
 
@@ -119,7 +118,6 @@ impl Service {
         }
     }
 
-    /// The error after the last restart.
     pub(crate) fn gave_up(&self, code: Option<u8>, reason: &str) -> anyhow::Error {
         let message = format!("the {} failed: {reason} (log: {})", self.name, self.log.display());
         coded(code.unwrap_or(exit::FAILURE), message)
@@ -127,7 +125,6 @@ impl Service {
 }
 
 impl Running {
-    /// Waits until it ends.
     pub(crate) async fn wait(&mut self) -> std::io::Result<ExitStatus> {
         self.child.wait().await
     }
@@ -145,7 +142,6 @@ impl Running {
         self.child.kill().await
     }
 
-    /// Sends SIGTERM.
     pub(crate) fn terminate(&self) {
         if let Some(pid) = self.child.id().and_then(|id| Pid::from_raw(id as i32)) {
             // It may have ended already.

@@ -45,7 +45,6 @@ pub(super) async fn accept(
     }
 }
 
-/// Tells an actor that there will be no more shards.
 pub(super) fn run_is_complete() -> v1::RolloutResponse {
     let drain = v1::Drain { reason: "the run is complete".to_owned(), finished: true };
     v1::RolloutResponse { message: Some(Response::Drain(drain)) }

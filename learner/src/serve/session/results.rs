@@ -75,7 +75,6 @@ impl Session {
         }
     }
 
-    /// Validates a whole result and sends the verdict to the actor.
     async fn on_result(
         &mut self,
         lease: LeaseId,
