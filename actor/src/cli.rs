@@ -62,8 +62,8 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
         run::run(config, PolicyWorker::maker(), metrics, context.stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
-            ActorError::Evicted { .. } => Failure::new(exit::INTERNAL, &error),
-            ActorError::Refused { .. } | ActorError::Unusable(_) | ActorError::Worker { .. } => {
+            ActorError::Evicted(..) => Failure::new(exit::INTERNAL, &error),
+            ActorError::Refused(..) | ActorError::Unusable(_) | ActorError::Worker(..) => {
                 Failure::new(exit::UNAVAILABLE, &error)
             }
         })

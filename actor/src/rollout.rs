@@ -180,15 +180,13 @@ fn to_world(code: ActionCode, heads: usize, symmetries: &[Symmetry], actions: &m
 /// What the episodes scored, and what the commander cost them.
 fn metrics(worlds: &dyn Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
     let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
-    let episodes = worlds.scores().into_iter().zip(ratios.chunks_exact(stages.max(1)));
-    let metrics = episodes.map(|(mut episode, ratios)| {
-        episode[COST_RATIO] = ratios.first().copied().unwrap_or(1.0);
-        if let Some(ratio) = ratios.get(1) {
-            episode[SECOND_COST_RATIO] = *ratio;
+    let mut episodes = worlds.scores();
+    for (episode, ratios) in episodes.iter_mut().zip(ratios.chunks_exact(stages.max(1))) {
+        for (metric, ratio) in [COST_RATIO, SECOND_COST_RATIO].into_iter().zip(ratios) {
+            episode[metric] = *ratio;
         }
-        episode
-    });
-    metrics.collect()
+    }
+    episodes
 }
 
 /// A trajectory to be filled, with room for its columns if they are kept.

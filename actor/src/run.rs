@@ -53,33 +53,18 @@ pub enum ActorError {
     /// No rollout threads.
     #[error("threads: 0 is too few; use --threads 1 or more")]
     NoThreads,
-    /// The learner rejected this actor.
-    #[error("the learner at {url} refused: {reason}")]
-    Refused {
-        /// Address of the learner.
-        url: String,
-        /// What it said.
-        reason: String,
-    },
-    /// The learner evicted this actor process: its results are invalid, or its shards fail.
-    #[error("the learner at {url} evicted this actor: {reason}")]
-    Evicted {
-        /// Address of the learner.
-        url: String,
-        /// What it said.
-        reason: String,
-    },
+    /// The learner at this address rejected this actor, for this reason.
+    #[error("the learner at {0} refused: {1}")]
+    Refused(String, String),
+    /// The learner at this address evicted this actor process: its results are invalid, or its shards fail.
+    #[error("the learner at {0} evicted this actor: {1}")]
+    Evicted(String, String),
     /// An error that every shard would meet.
     #[error("this actor cannot process any shard: {0}")]
     Unusable(WorkError),
-    /// This build cannot work on the run.
-    #[error("cannot work on run '{run_id}': {source}")]
-    Worker {
-        /// The run.
-        run_id: String,
-        /// What is missing.
-        source: WorkError,
-    },
+    /// This build cannot work on the run of this id.
+    #[error("cannot work on run '{0}': {1}")]
+    Worker(String, #[source] WorkError),
 }
 
 /// Works until `shutdown`, or until the run is complete, and counts in `metrics`. An actor retries while the learner is
@@ -151,10 +136,10 @@ impl Actor {
                     waiting = true;
                 }
                 SessionEnd::Refused(reason) => {
-                    return Err(ActorError::Refused { url: self.config.learner_url.clone(), reason });
+                    return Err(ActorError::Refused(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Evicted(reason) => {
-                    return Err(ActorError::Evicted { url: self.config.learner_url.clone(), reason });
+                    return Err(ActorError::Evicted(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Unusable(error) => return Err(ActorError::Unusable(error)),
                 SessionEnd::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
@@ -232,6 +217,6 @@ impl Actor {
         tracing::info!(run_id, threads, "joined a run");
         let started = tokio::task::spawn_blocking(move || RolloutPool::start(welcome, lease, threads, context)).await;
         let started = started.unwrap_or_else(|error| Err(WorkError::fatal(error.to_string())));
-        started.map_err(|source| ActorError::Worker { run_id, source })
+        started.map_err(|source| ActorError::Worker(run_id, source))
     }
 }

@@ -382,13 +382,12 @@ fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option
     Ok(same.then_some((summary, line)))
 }
 
+/// Training results and evaluations, each in the order of the plan.
 fn split(results: Vec<ShardResult>) -> (Vec<Trajectory>, Vec<EvalOutcome>) {
     let (mut trajectories, mut outcomes) = (Vec::new(), Vec::new());
-    for result in results {
-        match result {
-            ShardResult::Train(trajectory) => trajectories.push(trajectory),
-            ShardResult::Eval(outcome) => outcomes.push(outcome),
-        }
-    }
+    results.into_iter().for_each(|result| match result {
+        ShardResult::Train(trajectory) => trajectories.push(trajectory),
+        ShardResult::Eval(outcome) => outcomes.push(outcome),
+    });
     (trajectories, outcomes)
 }

@@ -1,7 +1,7 @@
 //! Evaluation in this process: shards of whole episodes on spawns that training never saw.
 
 use crate::failure::usage;
-use crate::folder::Trained;
+use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
@@ -9,9 +9,10 @@ use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
+use std::path::PathBuf;
 
 /// Evaluation set of `magex eval` unless another is named.
-pub(crate) const EVAL_SET: u32 = 100;
+const EVAL_SET: u32 = 100;
 /// Limit of agents per shard, unless a single episode has more: bounds the memory of a rollout.
 const AGENTS_PER_SHARD: usize = 800;
 const EPISODES_PER_SHARD: u32 = 16;
@@ -53,6 +54,32 @@ pub(crate) fn mode_name(mode: Mode) -> &'static str {
     }
 }
 
+/// A run, and the starts on which it is evaluated.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct Subject {
+    /// Run folder, or a weights file together with --config.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: PathBuf,
+    /// Configuration of a weights file.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Evaluation set: selects the starts; 3 or more.
+    #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = eval_set)]
+    pub(crate) eval_set: u32,
+    #[command(flatten)]
+    pub(crate) vary: Variation,
+}
+
+impl Subject {
+    /// Loads the run, with its configuration as it is evaluated.
+    pub(crate) fn load(&self) -> anyhow::Result<(Trained, RunConfig)> {
+        let trained = folder::load(&self.run, self.config.as_deref())?;
+        trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
+        let config = self.vary.apply(&trained)?;
+        Ok((trained, config))
+    }
+}
+
 /// What an evaluation changes about the run.
 #[derive(Debug, Clone, Default, PartialEq, clap::Args)]
 #[command(next_help_heading = "What is evaluated [default: as in the run]")]
@@ -76,7 +103,7 @@ pub(crate) struct Variation {
 
 impl Variation {
     /// The run's configuration as it is evaluated.
-    pub(crate) fn apply(&self, trained: &Trained) -> anyhow::Result<RunConfig> {
+    fn apply(&self, trained: &Trained) -> anyhow::Result<RunConfig> {
         let mut config = trained.config.clone();
         if let Some(agents) = self.agents.filter(|&agents| agents != config.task.agents) {
             let own = config.task.agents;
@@ -130,7 +157,7 @@ pub(crate) struct Episodes {
 }
 
 /// Parses an evaluation set; the sets that training uses are rejected.
-pub(crate) fn eval_set(text: &str) -> Result<u32, String> {
+fn eval_set(text: &str) -> Result<u32, String> {
     let first = EVAL_SET_TRAINING.max(EVAL_SET_FINAL) + 1;
     match text.parse() {
         Ok(set) if set >= first => Ok(set),

@@ -31,18 +31,15 @@ impl LoadedPolicy {
         })
     }
 
-    fn rollout(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
-        self.roller
-            .rollout(shard, |request| answer(&self.commander, self.random_assignment_fraction, request, &|| true))
-            .map_err(|e| CollectError::Shard { shard: *shard, reason: e.to_string() })
-    }
-
     /// Rolls out a plan on `threads` threads; the results are in the order of the plan.
     pub(crate) fn rollout_all(&self, plan: &[Shard], threads: usize) -> Result<Vec<ShardResult>, CollectError> {
-        parallel::in_order(threads, plan.len(), |index| self.rollout(&plan[index]))
-            .map_err(|_| CollectError::RolloutThread)?
-            .into_iter()
-            .collect()
+        let goals = |request: &_| answer(&self.commander, self.random_assignment_fraction, request, &|| true);
+        let rollout = |index: usize| {
+            let result = self.roller.rollout(&plan[index], goals);
+            result.map_err(|error| CollectError::Shard { shard: plan[index], reason: error.to_string() })
+        };
+        let results = parallel::in_order(threads, plan.len(), rollout).map_err(|_| CollectError::RolloutThread)?;
+        results.into_iter().collect()
     }
 }
 

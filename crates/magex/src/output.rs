@@ -72,17 +72,11 @@ impl std::fmt::Display for Table {
         let width = |c: usize| self.rows.iter().filter_map(|r| r.get(c)).map(|x| x.chars().count()).max().unwrap_or(0);
         let widths: Vec<usize> = (0..columns).map(width).collect();
         for (index, row) in self.rows.iter().enumerate() {
-            let mut line = String::new();
-            for (column, cell) in row.iter().enumerate() {
-                let width = widths[column];
-                let gap = if column == 0 { "  " } else { "   " };
-                line += gap;
-                line += &if column < self.left { format!("{cell:<width$}") } else { format!("{cell:>width$}") };
-            }
-            f.write_str(line.trim_end())?;
-            if index + 1 < self.rows.len() {
-                f.write_str("\n")?;
-            }
+            let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| {
+                if column < self.left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
+            });
+            let end = if index == 0 { "" } else { "\n" };
+            write!(f, "{end}  {}", cells.collect::<Vec<_>>().join("   ").trim_end())?;
         }
         Ok(())
     }

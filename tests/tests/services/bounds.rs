@@ -146,7 +146,7 @@ async fn an_actor_whose_results_are_garbage_now_and_then_is_evicted_and_nothing_
         iteration += 1;
     }
     let error = bad.end().await.unwrap_err();
-    assert!(matches!(&error, ActorError::Evicted { reason, .. } if reason.contains("NaN is not finite")), "{error}");
+    assert!(matches!(&error, ActorError::Evicted(_, reason) if reason.contains("NaN is not finite")), "{error}");
     assert_eq!(learner.ledger().rejected, 3);
     // Another actor does the rest.
     let good = Actor::start(&learner.url, "good", FakeWorker::default());

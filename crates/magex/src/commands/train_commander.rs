@@ -221,12 +221,7 @@ impl Training {
 }
 
 fn named(ratios: &[f64]) -> Value {
-    VALIDATION_SIZES
-        .iter()
-        .zip(ratios)
-        .map(|(n, ratio)| (n.to_string(), json!(ratio)))
-        .collect::<serde_json::Map<_, _>>()
-        .into()
+    VALIDATION_SIZES.iter().zip(ratios).map(|(n, ratio)| (n.to_string(), *ratio)).collect()
 }
 
 fn list(ratios: &[f64]) -> String {
