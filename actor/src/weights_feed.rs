@@ -13,29 +13,22 @@ use tonic::Status;
 pub(crate) async fn follow(channel: Channel, actor_id: String, cache: Arc<WeightsCache>, metrics: Arc<ActorMetrics>) {
     let mut backoff = Backoff::default();
     loop {
-        match watch(channel.clone(), &actor_id, &cache, &metrics, &mut backoff).await {
+        let watch = async {
+            let opening = WeightsStream::open(channel.clone(), &actor_id, SubscriberRole::Actor);
+            let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
+            while let Some((weights, _)) = stream.next().await? {
+                backoff.reset();
+                tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
+                metrics.weights_bytes.inc_by(weights.bytes.len() as u64);
+                metrics.weights_version.set(f64::from(weights.version.0));
+                cache.insert(weights);
+            }
+            Ok::<(), Status>(())
+        };
+        match watch.await {
             Ok(()) => tracing::debug!("the weights stream ended"),
             Err(status) => tracing::debug!(reason = status.message(), "the weights stream broke"),
         }
         tokio::time::sleep(backoff.next_wait()).await;
     }
-}
-
-async fn watch(
-    channel: Channel,
-    actor_id: &str,
-    cache: &WeightsCache,
-    metrics: &ActorMetrics,
-    backoff: &mut Backoff,
-) -> Result<(), Status> {
-    let opening = WeightsStream::open(channel, actor_id, SubscriberRole::Actor);
-    let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
-    while let Some((weights, _)) = stream.next().await? {
-        backoff.reset();
-        tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
-        metrics.weights_bytes.inc_by(weights.bytes.len() as u64);
-        metrics.weights_version.set(f64::from(weights.version.0));
-        cache.insert(weights);
-    }
-    Ok(())
 }

@@ -110,12 +110,12 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
                     Some(exit::TEMPORARY) => break Ok(TrainEnd::Stopped),
                     _ => lives -= 1,
                 }
-                if lives == 0 || code.is_some_and(|code| [exit::USAGE, exit::CANNOT_CREATE].contains(&code)) {
+                if lives == 0 || matches!(code, Some(exit::USAGE | exit::CANNOT_CREATE)) {
                     break Err(learner.gave_up(code, &reason));
                 }
                 tracing::warn!(reason, "the learner died; restarting it from its checkpoint");
-                let mut waits = [200].into_iter().chain(std::iter::repeat(1000));
-                let wait = || Duration::from_millis(waits.next().unwrap_or(1000));
+                let mut millis = 200;
+                let wait = || Duration::from_millis(std::mem::replace(&mut millis, 1000));
                 running = learner.restart(&mut lives, wait).await?;
             },
             Some(ended) = services.join_next() => {

@@ -5,7 +5,7 @@ use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
 use crate::serve::observer::ServiceObserver;
-use crate::serve::session;
+use crate::serve::session::handshake;
 use crate::serve::shared::Shared;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board;
@@ -26,7 +26,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Request, Response, Result, Streaming};
 
 /// Default time of a lease.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
@@ -145,7 +145,7 @@ struct LearnerApi {
 }
 
 impl LearnerApi {
-    fn check_open(&self) -> Result<(), Status> {
+    fn check_open(&self) -> Result<()> {
         if self.shared.control.closing.is_cancelled() {
             return Err(status::unavailable("the learner is shutting down", Duration::from_secs(1)));
         }
@@ -155,27 +155,24 @@ impl LearnerApi {
 
 #[tonic::async_trait]
 impl LearnerService for LearnerApi {
-    type RolloutStream = ReceiverStream<Result<v1::RolloutResponse, Status>>;
+    type RolloutStream = ReceiverStream<Result<v1::RolloutResponse>>;
 
     // Answers before the first message arrives, because the actor's call returns only then.
-    async fn rollout(
-        &self,
-        request: Request<Streaming<v1::RolloutRequest>>,
-    ) -> Result<Response<Self::RolloutStream>, Status> {
+    async fn rollout(&self, request: Request<Streaming<v1::RolloutRequest>>) -> Result<Response<Self::RolloutStream>> {
         caller(&request, &[Role::Actor])?;
         self.check_open()?;
         let address = request.remote_addr().map_or_else(String::new, |address| address.to_string());
         let (outbound, stream) = mpsc::channel(64);
-        tokio::spawn(session::run(self.shared.clone(), address, request.into_inner(), outbound));
+        tokio::spawn(handshake::serve(self.shared.clone(), address, request.into_inner(), outbound));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    type WatchWeightsStream = ReceiverStream<Result<v1::WatchWeightsResponse, Status>>;
+    type WatchWeightsStream = ReceiverStream<Result<v1::WatchWeightsResponse>>;
 
     async fn watch_weights(
         &self,
         request: Request<v1::WatchWeightsRequest>,
-    ) -> Result<Response<Self::WatchWeightsStream>, Status> {
+    ) -> Result<Response<Self::WatchWeightsStream>> {
         caller(&request, &[Role::Actor, Role::Commander])?;
         self.check_open()?;
         let request = request.into_inner();
@@ -205,14 +202,14 @@ impl LearnerService for LearnerApi {
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>, Status> {
+    async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>> {
         caller(&request, &[Role::Client])?;
         Ok(Response::new(v1::GetRunResponse { run: Some(self.shared.run_status()) }))
     }
 
-    type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse, Status>>;
+    type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse>>;
 
-    async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
+    async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>> {
         caller(&request, &[Role::Client])?;
         let permit = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(64);
@@ -225,28 +222,21 @@ impl LearnerService for LearnerApi {
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn checkpoint(
-        &self,
-        request: Request<v1::CheckpointRequest>,
-    ) -> Result<Response<v1::CheckpointResponse>, Status> {
+    async fn checkpoint(&self, request: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointResponse>> {
         caller(&request, &[])?;
         self.check_open()?;
         match self.shared.run_status().state() {
-            v1::RunState::Finished => {
-                return Err(status::failed_precondition("the run is complete and already on disk"));
-            }
-            v1::RunState::WaitingForActors => {
-                return Err(status::failed_precondition(
-                    "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain \
-                     the learner, which writes one at once",
-                ));
-            }
-            _ => self.shared.control.request_checkpoint(),
-        }
+            v1::RunState::Finished => Err(status::failed_precondition("the run is complete and already on disk")),
+            v1::RunState::WaitingForActors => Err(status::failed_precondition(
+                "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain the \
+                 learner, which writes one at once",
+            )),
+            _ => Ok(self.shared.control.request_checkpoint()),
+        }?;
         Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.status.current_iteration() }))
     }
 
-    async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+    async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>> {
         caller(&request, &[])?;
         let reason = request.into_inner().reason;
         tracing::info!(reason, "drain requested");

@@ -1,7 +1,7 @@
 //! One connection of one actor: grants leases as its credit allows, receives results, and ends when the actor is silent for
 //! the time of a lease. The actor's end is `session` of `magex-actor`.
 
-mod handshake;
+pub(crate) mod handshake;
 mod results;
 
 use crate::serve::ledger::{LeaseId, SessionId};
@@ -48,18 +48,6 @@ impl SessionEnd {
             Self::Closing => "closing",
             Self::Refused(_) => "refused",
         }
-    }
-}
-
-/// Serves one connection from its first message to its end.
-pub(crate) async fn run(
-    shared: Arc<Shared>,
-    address: String,
-    inbound: Streaming<v1::RolloutRequest>,
-    outbound: Outbound,
-) {
-    if let Some((session, inbound)) = handshake::accept(shared, address, inbound, outbound).await {
-        session.serve(inbound).await;
     }
 }
 

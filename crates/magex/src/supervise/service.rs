@@ -101,9 +101,7 @@ impl Service {
             Err(_) => Err(anyhow!("the {} was not ready within {} s", self.name, START.as_secs())),
         }
     }
-}
 
-impl Service {
     /// Starts it again after a wait. A start that fails (killed again, the port still in use) costs one of the lives.
     pub(crate) async fn restart(&self, lives: &mut u32, mut wait: impl FnMut() -> Duration) -> anyhow::Result<Running> {
         loop {
@@ -193,7 +191,7 @@ pub(crate) async fn keep(service: Service, first: Running, stop: CancellationTok
         }
         lives -= 1;
         let (code, reason) = (code_of(status), running.failure(status));
-        if lives == 0 || code.is_some_and(|code| code == exit::USAGE || code == exit::UNAVAILABLE) {
+        if lives == 0 || matches!(code, Some(exit::USAGE | exit::UNAVAILABLE)) {
             return Err(service.gave_up(code, &reason));
         }
         tracing::warn!(service = service.name, reason, "the service died; restarting it");

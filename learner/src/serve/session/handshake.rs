@@ -13,36 +13,30 @@ use std::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 
-/// Waits for the hello and registers the actor. `None` if the connection ends here; the actor has been sent the reason.
-pub(super) async fn accept(
+/// Serves one connection: waits for the hello, registers the actor and runs its session.
+pub(crate) async fn serve(
     shared: Arc<Shared>,
     address: String,
     mut inbound: Streaming<v1::RolloutRequest>,
     outbound: Outbound,
-) -> Option<(Session, Streaming<v1::RolloutRequest>)> {
+) {
     let first = tokio::select! {
-        () = shared.control.closing.cancelled() => return None,
-        first = tokio::time::timeout(shared.lease_time(), inbound.message()) => match first {
-            Ok(Ok(Some(message))) => message,
-            Ok(Ok(None) | Err(_)) => return None,
-            Err(_) => {
-                let _ = outbound.send(Err(Status::deadline_exceeded("hello: did not arrive in time"))).await;
-                return None;
+        () = shared.control.closing.cancelled() => return,
+        first = tokio::time::timeout(shared.lease_time(), inbound.message()) => first,
+    };
+    let refusal = match first {
+        Ok(Ok(Some(_))) if shared.status.finished() => Ok(run_is_complete()),
+        Ok(Ok(Some(first))) => match handshake(&shared, address, first, &outbound) {
+            Ok((registered, hello)) => return Session::new(shared, registered, hello, outbound).serve(inbound).await,
+            Err(refusal) => {
+                tracing::warn!(reason = refusal.message(), "rejected an actor");
+                Err(refusal)
             }
         },
+        Ok(Ok(None) | Err(_)) => return,
+        Err(_) => Err(Status::deadline_exceeded("hello: did not arrive in time")),
     };
-    if shared.status.finished() {
-        let _ = outbound.send(Ok(run_is_complete())).await;
-        return None;
-    }
-    match handshake(&shared, address, first, &outbound) {
-        Ok((registered, hello)) => Some((Session::new(shared, registered, hello, outbound), inbound)),
-        Err(refusal) => {
-            tracing::warn!(reason = refusal.message(), "rejected an actor");
-            let _ = outbound.send(Err(refusal)).await;
-            None
-        }
-    }
+    let _ = outbound.send(refusal).await;
 }
 
 pub(super) fn run_is_complete() -> v1::RolloutResponse {
