@@ -24,20 +24,6 @@ impl fmt::Display for StopReason {
     }
 }
 
-/// A plan that cannot be opened.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PlanError {
-    /// There are no shards.
-    #[error("the plan has no shards")]
-    Empty,
-    /// The same shard twice.
-    #[error("the plan names shard {0} of iteration {1} twice")]
-    Repeated(u32, u32),
-    /// The previous plan is not complete.
-    #[error("a plan is open with {0} of {1} shards done")]
-    Open(usize, usize),
-}
-
 /// Why a plan was not collected.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
@@ -52,9 +38,15 @@ pub enum CollectError {
         /// The reason of the last failure.
         reason: String,
     },
-    /// The plan is invalid.
-    #[error("plan: {0}")]
-    Plan(#[from] PlanError),
+    /// The plan has no shards.
+    #[error("plan: the plan has no shards")]
+    EmptyPlan,
+    /// The plan names this shard of this iteration twice.
+    #[error("plan: the plan names shard {0} of iteration {1} twice")]
+    Repeated(u32, u32),
+    /// The previous plan is not complete.
+    #[error("plan: a plan is open with {0} of {1} shards done")]
+    OpenPlan(usize, usize),
     /// The plan names weights that no actor can have.
     #[error("plan: names weights version {0}, which is not among the latest two that were published")]
     Version(WeightsVersion),

@@ -24,7 +24,7 @@ impl GrpcCollector {
         if let Some(shard) = plan.iter().find(|shard| !self.shared.board.is_kept(shard.version)) {
             return Err(CollectError::Version(shard.version));
         }
-        Ok(self.shared.work.open(plan)?)
+        self.shared.work.open(plan)
     }
 
     /// Blocks until the open plan is complete.

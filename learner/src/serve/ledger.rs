@@ -4,7 +4,7 @@
 //! of times. The results come out in the order of the plan, each exactly once. Every lease ends in exactly one way, and so do
 //! the episodes of its shard: leased = trained + duplicate + expired + rejected + failed + outstanding.
 
-use crate::run_events::PlanError;
+use crate::run_events::CollectError;
 use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
@@ -141,17 +141,17 @@ impl Ledger {
     }
 
     /// Opens a plan; the one before must have been taken or abandoned.
-    pub(crate) fn open(&mut self, plan: Vec<Shard>) -> Result<(), PlanError> {
+    pub(crate) fn open(&mut self, plan: Vec<Shard>) -> Result<(), CollectError> {
         if !self.plan.is_empty() {
-            return Err(PlanError::Open(self.done, self.plan.len()));
+            return Err(CollectError::OpenPlan(self.done, self.plan.len()));
         }
         if plan.is_empty() {
-            return Err(PlanError::Empty);
+            return Err(CollectError::EmptyPlan);
         }
         let mut position = HashMap::new();
         for (at, shard) in plan.iter().enumerate() {
             if position.insert(*shard, at).is_some() {
-                return Err(PlanError::Repeated(shard.index, shard.iteration.0));
+                return Err(CollectError::Repeated(shard.index, shard.iteration.0));
             }
         }
         self.queue = (0..plan.len()).collect();

@@ -3,7 +3,7 @@
 
 use crate::report::bottleneck::CollectTiming;
 use crate::report::shard_timing::ShardTiming;
-use crate::run_events::{CollectError, PlanError, StopReason};
+use crate::run_events::{CollectError, StopReason};
 use crate::serve::ledger::{GivenUp, Lease, Ledger};
 use crate::serve::lock_order::{OrderedMutex, Rank};
 use crate::serve::metrics::LearnerMetrics;
@@ -87,7 +87,7 @@ impl Work {
     }
 
     /// Opens a plan within the current span.
-    pub(crate) fn open(&self, plan: Vec<Shard>) -> Result<(), PlanError> {
+    pub(crate) fn open(&self, plan: Vec<Shard>) -> Result<(), CollectError> {
         self.update(|open| {
             open.trace = Span::current();
             open.ledger.open(plan)?;

@@ -13,7 +13,8 @@ use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::means::{EvalSummary, summarise};
 use magex_runtime::exit;
 use magex_runtime::process::processors;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Map, json};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -68,10 +69,12 @@ fn renamed(_: &str) -> Result<String, String> {
     Err("this option is now called --episode-seeds".into())
 }
 
+#[derive(Serialize)]
 struct Row {
     seed: u64,
     mode: Mode,
     spawn: Spawn,
+    #[serde(flatten)]
     summary: EvalSummary,
     wall_s: f64,
 }
@@ -153,7 +156,7 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         "scheduler": scheduler,
         "controller": format!("{:?}", vary.controller).to_lowercase(),
         "eval_set": args.subject.eval_set,
-        "rows": rows.iter().map(value).collect::<Result<Vec<_>, _>>()?,
+        "rows": rows,
         "mean": means,
     }));
     Ok(exit::OK)
@@ -173,15 +176,4 @@ fn cells(task: &TaskConfig, [spawn, seed]: [String; 2], mode: Mode, summary: &Ev
     let metrics = METRICS.iter().zip(summary.means).filter(|(metric, _)| metric.applies(task));
     let values = metrics.map(|(metric, mean)| mean.map_or_else(String::new, |mean| metric.write(mean)));
     [spawn, seed, mode_name(mode).into(), summary.episodes.to_string()].into_iter().chain(values).collect()
-}
-
-fn value(row: &Row) -> serde_json::Result<Value> {
-    let mut value = serde_json::to_value(row.summary)?;
-    if let Value::Object(map) = &mut value {
-        map.insert("seed".into(), json!(row.seed));
-        map.insert("mode".into(), json!(mode_name(row.mode)));
-        map.insert("spawn".into(), json!(row.spawn));
-        map.insert("wall_s".into(), json!(row.wall_s));
-    }
-    Ok(value)
 }
