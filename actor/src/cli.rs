@@ -74,13 +74,10 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
 }
 
 fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
-    let expected_task = match &args.config {
-        Some(path) => {
-            let named = |error: &dyn std::fmt::Display| Failure::usage(format!("{}: {error}", path.display()));
-            let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
-            Some(RunConfig::from_toml(&text).map_err(|error| named(&error))?.task.fingerprint())
-        }
-        None => None,
+    let fingerprint = |path: &PathBuf| {
+        let named = |error: &dyn std::fmt::Display| Failure::usage(format!("{}: {error}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
+        Ok(RunConfig::from_toml(&text).map_err(|error| named(&error))?.task.fingerprint())
     };
     Ok(ActorConfig {
         learner_url: args.learner.clone(),
@@ -88,7 +85,7 @@ fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
         client: args.security.read()?,
         actor_id: args.name.clone(),
         threads: args.threads,
-        expected_task,
+        expected_task: args.config.as_ref().map(fingerprint).transpose()?,
         stay: args.stay,
     })
 }

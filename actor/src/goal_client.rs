@@ -109,7 +109,9 @@ async fn ask(
             Ok(Err(status)) if is_transient(&status) => status.message().to_owned(),
             Ok(Err(status)) => {
                 return Err(match status.code() {
-                    Code::Unauthenticated | Code::PermissionDenied => GoalError::Unauthorized(status.message().to_owned()),
+                    Code::Unauthenticated | Code::PermissionDenied => {
+                        GoalError::Unauthorized(status.message().to_owned())
+                    }
                     code => GoalError::Refused(format!("{code}: {}", status.message())),
                 });
             }

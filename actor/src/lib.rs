@@ -9,7 +9,7 @@
 //! | [`policy_worker`] | the worker of production: the executor that the weights contain |
 //! | [`rollout`] | the rollout of one shard: a pure function of shard, seed, task, weights and goals |
 //! | [`goal_client`] | the goals of a shard, from the commander service |
-//! | `weights_feed`, `weights_cache` | the stream of weights, and the two latest versions |
+//! | `weights_cache` | the stream of weights, and the two latest versions |
 //! | `metrics` | the actor's Prometheus metrics |
 //! | [`cli`] | the command line of `magex-actor` |
 
@@ -22,5 +22,4 @@ mod rollout_pool;
 pub mod run;
 mod session;
 mod weights_cache;
-mod weights_feed;
 pub mod worker;

@@ -116,17 +116,12 @@ impl RolloutPool {
         self.threads.len().saturating_sub(self.busy)
     }
 
-    /// Queues a shard for the first idle thread; returns it when the queue is full.
-    pub(crate) fn submit(&mut self, shard: LeasedShard) -> Result<(), LeasedShard> {
-        let Some(shards) = &self.shards else { return Err(shard) };
-        match shards.try_send(shard) {
-            Ok(()) => {
-                self.busy += 1;
-                self.refresh_metrics();
-                Ok(())
-            }
-            Err(blocking::TrySendError::Full(shard) | blocking::TrySendError::Disconnected(shard)) => Err(shard),
-        }
+    /// Queues a shard for the first idle thread; false if the queue is full.
+    pub(crate) fn submit(&mut self, shard: LeasedShard) -> bool {
+        let queued = self.shards.as_ref().is_some_and(|shards| shards.try_send(shard).is_ok());
+        self.busy += usize::from(queued);
+        self.refresh_metrics();
+        queued
     }
 
     /// The next outcome. Cancel safe.

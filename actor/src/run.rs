@@ -4,8 +4,7 @@ use crate::metrics::ActorMetrics;
 use crate::rollout_pool::{PoolContext, RolloutPool};
 pub use crate::session::ActorReport;
 use crate::session::{self, Session, SessionEnd, UnacknowledgedResults};
-use crate::weights_cache::WeightsCache;
-use crate::weights_feed;
+use crate::weights_cache::{self, WeightsCache};
 use crate::worker::{MakeWorker, WorkError};
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
@@ -84,7 +83,7 @@ pub async fn run(
     // Two connections: results never delay weights.
     let metrics = Arc::new(ActorMetrics::new(&metrics));
     let feed = config.client.lazy_channel(&config.learner_url)?;
-    let feed = tokio::spawn(weights_feed::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone()));
+    let feed = tokio::spawn(weights_cache::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone()));
     let context = PoolContext { make_worker, cache, commander, runtime, metrics };
     let bulk = config.client.lazy_channel(&config.learner_url)?;
     let mut actor = Actor {

@@ -224,12 +224,11 @@ impl<'a> Session<'a> {
                 let (iteration, index) = (shard.iteration.0, shard.index);
                 let span = tracing::info_span!(target: trace::TARGET, parent: None, "rollout", iteration, index);
                 trace::continue_from(&span, &traceparent);
-                match self.pool.submit(LeasedShard { lease_id, shard, weights_sha256, received: Instant::now(), span })
-                {
-                    Ok(()) => return,
-                    // Another actor may have an idle thread.
-                    Err(_) => ("more leases than credit".to_owned(), true),
+                if self.pool.submit(LeasedShard { lease_id, shard, weights_sha256, received: Instant::now(), span }) {
+                    return;
                 }
+                // Another actor may have an idle thread.
+                ("more leases than credit".to_owned(), true)
             }
             Err(error) => (error.to_string(), false),
         };

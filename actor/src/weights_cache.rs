@@ -1,11 +1,18 @@
-//! The weights that an actor holds: the two latest arrivals, verified.
+//! The weights that an actor holds: the two latest arrivals, verified. They arrive over a connection of their own, so that bulk
+//! results never delay them.
 
+use crate::metrics::ActorMetrics;
 use magex_proto::goals::WeightsKey;
+use magex_proto::v1::SubscriberRole;
 use magex_proto::weights::Weights;
+use magex_proto::weights_watch::{OPEN_TIMEOUT, WeightsStream, late};
+use magex_runtime::backoff::Backoff;
+use magex_runtime::client::Channel;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
+use tonic::Status;
 
 const KEPT: usize = 2;
 
@@ -34,9 +41,8 @@ impl WeightsCache {
     /// Returns these weights as soon as they have arrived, if they do within `patience`.
     pub(crate) async fn wait(&self, wanted: &WeightsKey, patience: Duration) -> Result<Arc<Weights>, WeightsLate> {
         let WeightsKey { run_id, version, sha256 } = wanted;
-        let is_wanted = |weights: &&Arc<Weights>| {
-            (&weights.run_id, &weights.version, &weights.sha256) == (run_id, version, sha256)
-        };
+        let is_wanted =
+            |weights: &&Arc<Weights>| (&weights.run_id, &weights.version, &weights.sha256) == (run_id, version, sha256);
         let mut held = self.0.subscribe();
         let arrival = held.wait_for(|held| held.iter().any(|weights| is_wanted(&weights)));
         let arrived = tokio::time::timeout(patience, arrival).await.ok().and_then(Result::ok);
@@ -44,6 +50,30 @@ impl WeightsCache {
             let held = self.0.borrow().iter().map(|weights| weights.version.0).collect();
             WeightsLate { wanted: version.0, waited: patience, held }
         })
+    }
+}
+
+/// Follows the learner's weights and reconnects after every failure. Never returns.
+pub(crate) async fn follow(channel: Channel, actor_id: String, cache: Arc<WeightsCache>, metrics: Arc<ActorMetrics>) {
+    let mut backoff = Backoff::default();
+    loop {
+        let arrivals = async {
+            let opening = WeightsStream::open(channel.clone(), &actor_id, SubscriberRole::Actor);
+            let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
+            while let Some((weights, _)) = stream.next().await? {
+                backoff.reset();
+                tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
+                metrics.weights_bytes.inc_by(weights.bytes.len() as u64);
+                metrics.weights_version.set(f64::from(weights.version.0));
+                cache.insert(weights);
+            }
+            Ok::<(), Status>(())
+        };
+        match arrivals.await {
+            Ok(()) => tracing::debug!("the weights stream ended"),
+            Err(status) => tracing::debug!(reason = status.message(), "the weights stream broke"),
+        }
+        tokio::time::sleep(backoff.next_wait()).await;
     }
 }
 

@@ -1,7 +1,6 @@
 //! The observers of a run: what it writes for people and for tools.
 
 pub mod bottleneck;
-mod live_page;
 pub mod means;
 pub(crate) mod metrics_file;
 pub mod observer;

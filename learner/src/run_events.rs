@@ -1,8 +1,8 @@
 //! Events of a run, and the reasons for which collecting or training ends.
 
 use magex_core::ids::{RunId, Shard, WeightsVersion};
-use magex_proto::v1;
 use magex_nets::params::ParamError;
+use magex_proto::v1;
 use std::fmt;
 
 /// Why the learner stops before the end of the run.

@@ -11,7 +11,6 @@ pub(crate) mod metrics;
 pub mod observer;
 mod patience;
 pub(crate) mod roster;
-mod run_status;
 pub mod service;
 pub(crate) mod session;
 pub(crate) mod shared;

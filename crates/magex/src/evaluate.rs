@@ -108,15 +108,13 @@ impl Variation {
         if let Some(agents) = self.agents.filter(|&agents| agents != config.task.agents) {
             let own = config.task.agents;
             let (executor, scheduler) = (config.executor.kind, self.scheduler_of(&config));
-            let fixed = if executor.fixed_team_size() && self.controller == Controller::Learned {
-                Some((format!("the {executor} executor"), ""))
-            } else if scheduler.fixed_team_size() {
-                Some((format!("the {scheduler} scheduler"), "; use --scheduler exact"))
-            } else {
-                None
-            };
-            if let Some((part, remedy)) = fixed {
-                return Err(usage(format!("--agents {agents}: {part} of this run was built for {own} agents{remedy}")));
+            let built_for = format!("of this run was built for {own} agents");
+            if executor.fixed_team_size() && self.controller == Controller::Learned {
+                return Err(usage(format!("--agents {agents}: the {executor} executor {built_for}")));
+            }
+            if scheduler.fixed_team_size() {
+                let remedy = "use --scheduler exact";
+                return Err(usage(format!("--agents {agents}: the {scheduler} scheduler {built_for}; {remedy}")));
             }
             config.task = config.task.resized(agents);
         }

@@ -6,9 +6,10 @@ use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1::IterationEvent;
 use magex_proto::weights::Weights;
-use magex_viewer::page::{Phase, RunEnd};
+use magex_viewer::page::{LivePage, Phase, RunEnd};
 use std::fmt::Debug;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
@@ -81,5 +82,35 @@ pub trait RunObserver: Debug + Send {
 impl RunObserver for Sender<RunEvent> {
     fn event(&mut self, event: &RunEvent) {
         let _ = self.send(event.clone());
+    }
+}
+
+impl RunObserver for Arc<LivePage> {
+    fn begin(&mut self, start: RunStart<'_>) {
+        LivePage::begin(self, start.run_id, start.folder);
+    }
+
+    fn wants_recording(&self) -> bool {
+        true
+    }
+
+    fn phase(&mut self, phase: Phase) {
+        LivePage::phase(self, phase);
+    }
+
+    fn published(&mut self, weights: &Weights) {
+        LivePage::published(self, weights);
+    }
+
+    fn evaluated(&mut self, outcomes: &[EvalOutcome]) {
+        LivePage::evaluated(self, outcomes);
+    }
+
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
+        self.line(&report.metrics_json);
+    }
+
+    fn end(&mut self, end: &RunEnd) {
+        self.ended(end.clone());
     }
 }

@@ -27,18 +27,13 @@ struct Event {
     wall_time: f64,
     #[prost(int64, tag = "2")]
     step: i64,
-    #[prost(oneof = "What", tags = "3, 5, 7")]
-    what: Option<What>,
-}
-
-#[derive(Clone, PartialEq, prost::Oneof)]
-enum What {
-    #[prost(string, tag = "3")]
-    FileVersion(String),
-    #[prost(message, tag = "5")]
-    Summary(Summary),
-    #[prost(message, tag = "7")]
-    SessionLog(SessionLog),
+    /// One of this and the next two is set.
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -97,7 +92,7 @@ impl EventFile {
         if let Ok(line) = serde_json::from_str(line) {
             scalars("", &line, &mut values);
         }
-        let record = record(step, What::Summary(Summary { values }));
+        let record = record(step, Event { summary: Some(Summary { values }), ..Event::default() });
         // One write, so that a concurrent reader finds whole records.
         file.write_all(&record).map_err(|error| (path.clone(), error))
     }
@@ -123,9 +118,9 @@ fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
             other => break (other?, path),
         }
     };
-    let mut head = record(0, What::FileVersion("brain.Event:2".to_owned()));
+    let mut head = record(0, Event { file_version: Some("brain.Event:2".to_owned()), ..Event::default() });
     if let Some(steps) = resumed {
-        head.extend(record(steps + 1, What::SessionLog(SessionLog { status: 1 })));
+        head.extend(record(steps + 1, Event { session_log: Some(SessionLog { status: 1 }), ..Event::default() }));
     }
     file.write_all(&head)?;
     Ok((file, path))
@@ -148,10 +143,10 @@ fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
     }
 }
 
-fn record(step: u64, what: What) -> Vec<u8> {
+fn record(step: u64, event: Event) -> Vec<u8> {
     #[allow(clippy::disallowed_methods, reason = "what a person reads in TensorBoard; no number of a run")]
     let wall_time = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
-    let event = Event { wall_time, step: step as i64, what: Some(what) }.encode_to_vec();
+    let event = Event { wall_time, step: step as i64, ..event }.encode_to_vec();
     let length = (event.len() as u64).to_le_bytes();
     [&length[..], &masked(&length), &event, &masked(&event)].concat()
 }

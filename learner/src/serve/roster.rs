@@ -3,7 +3,6 @@
 use crate::serve::ledger::SessionId;
 use crate::serve::lock_order::{OrderedMutex, Rank};
 use crate::serve::metrics::LearnerMetrics;
-use magex_core::ids::WeightsVersion;
 use magex_proto::v1;
 use magex_runtime::status;
 use std::collections::{BTreeMap, VecDeque};
@@ -21,12 +20,9 @@ const MAX_EVICTED: usize = 1024;
 /// One session, as the rest of the service sees it.
 #[derive(Debug, Clone)]
 pub(crate) struct ActorEntry {
-    pub(crate) actor_id: String,
+    /// Without its leases, which the ledger knows, and without the age of its last message.
+    pub(crate) status: v1::ActorStatus,
     pub(crate) process_id: u64,
-    pub(crate) address: String,
-    pub(crate) threads: u32,
-    pub(crate) shards_done: u64,
-    pub(crate) weights_version: Option<WeightsVersion>,
     pub(crate) last_seen: Instant,
     /// Ends the session: the same process has connected again.
     pub(crate) replaced: CancellationToken,
@@ -96,7 +92,7 @@ impl Roster {
             return Err(status::resource_exhausted(problem, Duration::from_secs(5)));
         }
         let id = SessionId(self.next_session.fetch_add(1, Ordering::Relaxed));
-        members.missing.remove(&actor.actor_id);
+        members.missing.remove(&actor.status.actor_id);
         members.connected.insert(id, actor);
         Ok(id)
     }
@@ -108,7 +104,7 @@ impl Roster {
     /// Records that an actor is missing, unless it has another session.
     pub(crate) fn mark_missing(&self, name: &str) {
         let mut members = self.members.lock();
-        let connected = members.connected.values().any(|actor| actor.actor_id == name);
+        let connected = members.connected.values().any(|actor| actor.status.actor_id == name);
         if !connected && members.missing.len() < MAX_MISSING {
             members.missing.insert(name.to_owned(), Instant::now());
         }
@@ -156,7 +152,7 @@ impl Roster {
         let connected = members.connected.len();
         metrics.actors_live.set(connected as f64);
         metrics.actors_expected.set((connected + members.missing.len()) as f64);
-        metrics.actor_threads.set(members.connected.values().map(|actor| f64::from(actor.threads)).sum());
+        metrics.actor_threads.set(members.connected.values().map(|actor| f64::from(actor.status.threads)).sum());
         metrics.queue("actors", members.connected.values().map(ActorEntry::queued_messages).sum());
     }
 }

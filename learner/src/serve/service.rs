@@ -5,7 +5,7 @@ use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
 use crate::serve::observer::ServiceObserver;
-use crate::serve::session::handshake;
+use crate::serve::session;
 use crate::serve::shared::Shared;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board;
@@ -163,7 +163,7 @@ impl LearnerService for LearnerApi {
         self.check_open()?;
         let address = request.remote_addr().map_or_else(String::new, |address| address.to_string());
         let (outbound, stream) = mpsc::channel(64);
-        tokio::spawn(handshake::serve(self.shared.clone(), address, request.into_inner(), outbound));
+        tokio::spawn(session::serve(self.shared.clone(), address, request.into_inner(), outbound));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 

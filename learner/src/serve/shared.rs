@@ -18,13 +18,15 @@ use crate::run_events::{CollectError, StopReason};
 use crate::run_identity::RunIdentity;
 use crate::serve::control::Control;
 use crate::serve::events::Events;
-use crate::serve::ledger::SessionId;
+use crate::serve::ledger::{Ledger, SessionId};
 use crate::serve::metrics::LearnerMetrics;
 use crate::serve::roster::Roster;
 use crate::serve::status::RunStatusCache;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board::{Weights, WeightsBoard};
 use crate::serve::work::{CollectedPlan, Work};
+use magex_core::ids::ShardKind;
+use magex_proto::v1;
 use magex_runtime::metrics::Metrics;
 use magex_runtime::status;
 use std::sync::Arc;
@@ -121,5 +123,52 @@ impl Shared {
     pub(crate) fn refresh_gauges(&self) {
         self.roster.refresh(&self.metrics);
         self.metrics.queue("events", self.events.len());
+    }
+
+    /// The answer of `GetRun`.
+    pub(crate) fn run_status(&self) -> v1::RunStatus {
+        let latest = self.board.latest();
+        let sessions = self.roster.sessions();
+        // One lock for the state, the counters and the leases, so that they agree with each other.
+        self.work.inspect(|ledger| {
+            let (done, total) = ledger.progress();
+            let rows = sessions.into_iter().map(|(session, actor)| v1::ActorStatus {
+                leases: ledger.leases_of(session) as u32,
+                last_seen_ms: actor.last_seen.elapsed().as_millis() as u64,
+                ..actor.status
+            });
+            let actors: Vec<v1::ActorStatus> = rows.collect();
+            v1::RunStatus {
+                run_id: self.run.run_id.0.clone(),
+                name: self.run.name.clone(),
+                task_fingerprint: self.run.task_fingerprint.clone(),
+                state: self.run_state(actors.len(), ledger).into(),
+                actors,
+                ledger: Some(ledger.counters()),
+                episodes: Some(ledger.episodes()),
+                shards_done: done as u32,
+                shards_total: total as u32,
+                weights_version: latest.as_ref().map_or(0, |weights| weights.version.0),
+                weights_sha256: latest.as_ref().map_or_else(String::new, |weights| weights.sha256.clone()),
+                ..self.status.reported()
+            }
+        })
+    }
+
+    fn run_state(&self, actors: usize, ledger: &Ledger) -> v1::RunState {
+        let (done, total) = ledger.progress();
+        if self.status.finished() {
+            v1::RunState::Finished
+        } else if self.control.stop_requested().is_some() {
+            v1::RunState::Draining
+        } else if done >= total {
+            v1::RunState::Training
+        } else if actors == 0 {
+            v1::RunState::WaitingForActors
+        } else if ledger.plan().all(|shard| shard.kind == ShardKind::Eval) {
+            v1::RunState::Evaluating
+        } else {
+            v1::RunState::Collecting
+        }
     }
 }

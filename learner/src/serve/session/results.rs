@@ -112,8 +112,8 @@ impl Session {
             Verdict::Accepted => {
                 self.failed = 0;
                 self.shared.roster.update(self.id, |actor| {
-                    actor.shards_done += 1;
-                    actor.weights_version = Some(shard.version);
+                    actor.status.shards_done += 1;
+                    actor.status.weights_version = Some(shard.version.0);
                 });
                 self.acknowledge(lease, v1::Verdict::Accepted, String::new()).await
             }
