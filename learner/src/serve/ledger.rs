@@ -8,6 +8,7 @@ use crate::run_events::CollectError;
 use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
+use magex_proto::v1::Verdict;
 /// Totals of the leases so far, by how they ended: of shards, or of their episodes. `leased` includes late results of leases
 /// that the ledger no longer knows.
 pub(crate) use magex_proto::v1::LedgerStatus as Counters;
@@ -27,15 +28,6 @@ pub(crate) struct LeaseId(pub(crate) u64);
 pub(crate) struct Lease {
     pub(crate) id: LeaseId,
     pub(crate) shard: Shard,
-}
-
-/// The verdict on a result.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    Accepted,
-    /// The shard is complete already, or belongs to no open plan.
-    Duplicate,
-    Rejected(FieldError),
 }
 
 /// The total that a lease is counted in when it ends.
@@ -71,13 +63,6 @@ fn balanced(totals: Counters, outstanding: u64) -> Counters {
     let Counters { leased, trained, duplicate, expired, rejected, failed, .. } = totals;
     let ended = trained + duplicate + expired + rejected + failed + outstanding;
     Counters { outstanding, residual: leased.wrapping_sub(ended).cast_signed(), ..totals }
-}
-
-/// A shard that fails at every actor.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct GivenUp {
-    pub(crate) shard: Shard,
-    pub(crate) reason: String,
 }
 
 /// A permanent failure of a shard: the actor reports that a retry would fail too.
@@ -131,7 +116,8 @@ pub(crate) struct Ledger {
     held: BTreeMap<LeaseId, HeldLease>,
     done: usize,
     totals: Totals,
-    given_up: Option<GivenUp>,
+    /// A shard that fails at every actor, and the reason of its last failure.
+    given_up: Option<(Shard, String)>,
 }
 
 impl Ledger {
@@ -180,13 +166,22 @@ impl Ledger {
         }
     }
 
-    /// Accepts a valid result. A result whose lease has ended (its session was lost, or the learner restarted) counts too: a
-    /// shard's result does not depend on which actor computes it.
-    pub(crate) fn complete(&mut self, session: SessionId, lease: LeaseId, result: ShardResult) -> Verdict {
+    /// Accepts a valid result, unless the shard is complete already or belongs to no open plan: that is a duplicate. A result
+    /// whose lease has ended (its session was lost, or the learner restarted) counts too: a shard's result does not depend on
+    /// which actor computes it.
+    ///
+    /// # Errors
+    /// The result is rejected: the lease was for another shard.
+    pub(crate) fn complete(
+        &mut self,
+        session: SessionId,
+        lease: LeaseId,
+        result: ShardResult,
+    ) -> Result<Verdict, FieldError> {
         let shard = *result.shard();
         if self.held_by(session, lease).is_some_and(|held| held.shard != shard) {
             self.reject(session, lease);
-            return Verdict::Rejected(FieldError::new("shard", "not the one that was leased"));
+            return Err(FieldError::new("shard", "not the one that was leased"));
         }
         if self.release(session, lease).is_none() {
             self.totals.leased(shard.episodes);
@@ -196,11 +191,11 @@ impl Ledger {
                 slot.result = Some(result);
                 self.done += 1;
                 self.totals.ended(TRAINED, shard.episodes);
-                Verdict::Accepted
+                Ok(Verdict::Accepted)
             }
             _ => {
                 self.totals.ended(DUPLICATE, shard.episodes);
-                Verdict::Duplicate
+                Ok(Verdict::Duplicate)
             }
         }
     }
@@ -232,7 +227,7 @@ impl Ledger {
         if let Some(&at) = self.position.get(&shard) {
             let slot = &mut self.plan[at];
             if slot.fail(failure) && slot.result.is_none() {
-                self.given_up = Some(GivenUp { shard, reason: failure.reason.to_owned() });
+                self.given_up = Some((shard, failure.reason.to_owned()));
             }
         }
         self.give_back(session, lease);
@@ -286,7 +281,7 @@ impl Ledger {
         self.plan.iter().map(|slot| &slot.shard)
     }
 
-    pub(crate) fn given_up(&self) -> Option<&GivenUp> {
+    pub(crate) fn given_up(&self) -> Option<&(Shard, String)> {
         self.given_up.as_ref()
     }
 

@@ -4,7 +4,7 @@
 use crate::report::bottleneck::CollectTiming;
 use crate::report::shard_timing::ShardTiming;
 use crate::run_events::{CollectError, StopReason};
-use crate::serve::ledger::{GivenUp, Lease, Ledger};
+use crate::serve::ledger::{Lease, Ledger};
 use crate::serve::lock_order::{OrderedMutex, Rank};
 use crate::serve::metrics::LearnerMetrics;
 use magex_core::ids::Shard;
@@ -112,7 +112,7 @@ impl Work {
                 let (timing, ages) = open.timing.finish(Instant::now());
                 break Ok(CollectedPlan { results, timing, ages });
             }
-            if let Some(GivenUp { shard, reason }) = open.ledger.given_up().cloned() {
+            if let Some((shard, reason)) = open.ledger.given_up().cloned() {
                 break Err(CollectError::Shard { shard, reason });
             }
             if let Some(reason) = stop() {

@@ -2,7 +2,7 @@
 
 use super::{Session, SessionEnd};
 use crate::run_events::describe;
-use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure, Verdict};
+use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure};
 use crate::serve::metrics::steps_of;
 use crate::serve::validate::validate;
 use bytes::Bytes;
@@ -98,7 +98,7 @@ impl Session {
         // reads both.
         let verdict = self.shared.work.update(|open| {
             let verdict = open.ledger.complete(self.id, lease, result);
-            if verdict == Verdict::Accepted {
+            if verdict == Ok(v1::Verdict::Accepted) {
                 let now = Instant::now();
                 // The grant of a lease of an earlier session is unknown, and so is its duration.
                 let since_grant = granted.as_ref().map_or(Duration::ZERO, |granted| now - granted.since);
@@ -108,22 +108,20 @@ impl Session {
             }
             verdict
         });
-        match verdict {
-            Verdict::Accepted => {
-                self.failed = 0;
-                self.shared.roster.update(self.id, |actor| {
-                    actor.status.shards_done += 1;
-                    actor.status.weights_version = Some(shard.version.0);
-                });
-                self.acknowledge(lease, v1::Verdict::Accepted, String::new()).await
-            }
-            Verdict::Duplicate => {
-                self.failed = 0;
-                tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
-                self.acknowledge(lease, v1::Verdict::Duplicate, String::new()).await
-            }
-            Verdict::Rejected(error) => self.reject(lease, error).await,
+        let verdict = match verdict {
+            Ok(verdict) => verdict,
+            Err(error) => return self.reject(lease, error).await,
+        };
+        self.failed = 0;
+        if verdict == v1::Verdict::Accepted {
+            self.shared.roster.update(self.id, |actor| {
+                actor.status.shards_done += 1;
+                actor.status.weights_version = Some(shard.version.0);
+            });
+        } else {
+            tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
         }
+        self.acknowledge(lease, verdict, String::new()).await
     }
 
     async fn validate(&self, bytes: Bytes) -> Result<ShardResult, FieldError> {
