@@ -1,7 +1,7 @@
 //! The actor's command line.
 
-use crate::policy_worker::PolicyWorker;
 use crate::run::{self, ActorConfig, ActorError, ActorReport};
+use crate::worker::PolicyWorker;
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_runtime::exit::{self, Failure};

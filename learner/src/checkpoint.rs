@@ -207,12 +207,7 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
 /// Removes what a kill left of checkpoints that were being written. No other process may be writing.
 pub fn clean(run: &Path) {
     let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
-    let unfinished = |path: &Path| {
-        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        let digits = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp"));
-        digits.is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
-    };
-    for path in entries.map(|entry| entry.path()).filter(|path| unfinished(path)) {
+    for path in entries.map(|entry| entry.path()).filter(|path| hidden(path, ".tmp").is_some()) {
         if let Err(error) = fs::remove_dir_all(&path) {
             // It only takes room.
             tracing::warn!(%error, path = %path.display(), "an unfinished checkpoint cannot be removed");
@@ -233,11 +228,18 @@ pub fn list(run: &Path) -> Vec<PathBuf> {
 
 /// `000012` and `.000012.old`: the number, and whether the folder is in its place.
 fn numbered(path: PathBuf) -> Option<(u64, bool, PathBuf)> {
-    let name = path.file_name()?.to_str()?;
-    let replaced = name.strip_prefix('.').and_then(|name| name.strip_suffix(".old"));
-    let digits = replaced.unwrap_or(name);
-    let number = digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())??;
+    let replaced = hidden(&path, ".old");
+    let number = replaced.or_else(|| number(path.file_name()?.to_str()?))?;
     Some((number, replaced.is_none(), path))
+}
+
+/// The number of `.000012` with an ending.
+fn hidden(path: &Path, ending: &str) -> Option<u64> {
+    number(path.file_name()?.to_str()?.strip_prefix('.')?.strip_suffix(ending)?)
+}
+
+fn number(digits: &str) -> Option<u64> {
+    digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
 /// Checks a checkpoint's hashes and reads it into networks laid out like `template`.

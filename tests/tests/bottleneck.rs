@@ -2,9 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_actor::goal_client::GrpcGoals;
-use magex_actor::policy_worker::PolicyWorker;
 use magex_actor::run::ActorConfig;
-use magex_actor::worker::{MakeWorker, WorkError, Worker};
+use magex_actor::worker::{MakeWorker, PolicyWorker, WorkError, Worker};
 use magex_commander::run_scheduler::load_scheduler;
 use magex_commander::service::ServiceConfig;
 use magex_core::config::{ExecutorKind, RunConfig};

@@ -14,9 +14,6 @@ use tonic::Status;
 /// hours of a run; metrics.jsonl has all lines.
 const KEPT: usize = 256;
 
-/// Number of events copied per lock, so that the log is locked only briefly.
-const BATCH: usize = 64;
-
 #[derive(Debug, Default)]
 struct Log {
     /// Number of the first event kept.
@@ -25,10 +22,10 @@ struct Log {
 }
 
 impl Log {
-    /// At most [`BATCH`] events from number `from` on, with the number of the first.
+    /// The kept events from number `from` on, with the number of the first.
     fn since(&self, from: u64) -> (u64, Vec<Arc<RunEvent>>) {
         let start = from.max(self.first);
-        (start, self.events.iter().skip((start - self.first) as usize).take(BATCH).cloned().collect())
+        (start, self.events.iter().skip((start - self.first) as usize).cloned().collect())
     }
 }
 

@@ -8,10 +8,10 @@ use crate::run_events::CollectError;
 use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
-use magex_proto::v1::Verdict;
 /// Totals of the leases so far, by how they ended: of shards, or of their episodes. `leased` includes late results of leases
 /// that the ledger no longer knows.
 pub(crate) use magex_proto::v1::LedgerStatus as Counters;
+use magex_proto::v1::Verdict;
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 
 /// Permanent (not retryable) failures before a shard is given up or an actor is evicted.

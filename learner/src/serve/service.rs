@@ -80,9 +80,8 @@ impl LearnerHandle {
     /// Serves until `shutdown`. Then the trainer stops, actors receive the reason, streams end, and the call returns within
     /// [`server::GRACE`]. Cancel `shutdown` after the end of the run too: actors then receive that the run is complete.
     pub async fn serve(&self, incoming: Incoming, shutdown: CancellationToken) -> Result<(), ServeError> {
-        let (health, health_service) = Health::new::<LearnerServiceServer<LearnerApi>>().await;
-        let api = LearnerApi { shared: self.shared.clone() };
-        let service = LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let (health, health_service) = Health::new::<LearnerServiceServer<Self>>().await;
+        let service = LearnerServiceServer::new(self.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
         let connections = incoming.connections();
         let rules = Rules {
             access: self.security.access.clone(),
@@ -137,14 +136,7 @@ impl LearnerHandle {
     pub fn close(&self) {
         self.shared.close();
     }
-}
 
-#[derive(Debug)]
-struct LearnerApi {
-    shared: Arc<Shared>,
-}
-
-impl LearnerApi {
     fn check_open(&self) -> Result<()> {
         if self.shared.control.closing.is_cancelled() {
             return Err(status::unavailable("the learner is shutting down", Duration::from_secs(1)));
@@ -154,7 +146,7 @@ impl LearnerApi {
 }
 
 #[tonic::async_trait]
-impl LearnerService for LearnerApi {
+impl LearnerService for LearnerHandle {
     type RolloutStream = ReceiverStream<Result<v1::RolloutResponse>>;
 
     // Answers before the first message arrives, because the actor's call returns only then.
