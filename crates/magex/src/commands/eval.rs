@@ -39,8 +39,6 @@ Exit codes: 0 success, 1 evaluation failed, 64 wrong usage or configuration";
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct EvalArgs {
-    #[command(flatten)]
-    subject: Subject,
     /// Episodes per row.
     #[arg(long, value_name = "K", default_value_t = 100, value_parser = settings::count)]
     episodes: u32,
@@ -62,6 +60,8 @@ pub(crate) struct EvalArgs {
     /// Write a replay of the first episode of the first row.
     #[arg(long, value_name = "FILE.html")]
     record: Option<PathBuf>,
+    #[command(flatten)]
+    subject: Subject,
 }
 
 /// Rejects `--seeds`, which could be mistaken for the seeds of training runs.

@@ -24,8 +24,6 @@ Exit codes: 0 success, 1 rollout failed, 64 wrong usage or configuration,
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct ReplayArgs {
-    #[command(flatten)]
-    subject: Subject,
     /// The page [default: replay.html in the run folder].
     #[arg(long, short, value_name = "FILE.html")]
     out: Option<PathBuf>,
@@ -35,6 +33,8 @@ pub(crate) struct ReplayArgs {
     /// How actions and goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
     mode: Modes,
+    #[command(flatten)]
+    subject: Subject,
 }
 
 pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<u8> {
