@@ -8,10 +8,7 @@ use crate::run_events::CollectError;
 use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
-/// Totals of the leases so far, by how they ended: of shards, or of their episodes. `leased` includes late results of leases
-/// that the ledger no longer knows.
-pub(crate) use magex_proto::v1::LedgerStatus as Counters;
-use magex_proto::v1::Verdict;
+use magex_proto::v1::{LedgerStatus, Verdict};
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 
 /// Permanent (not retryable) failures before a shard is given up or an actor is evicted.
@@ -29,6 +26,10 @@ pub(crate) struct Lease {
     pub(crate) id: LeaseId,
     pub(crate) shard: Shard,
 }
+
+/// Totals of the leases so far, by how they ended: of shards, or of their episodes. `leased` includes late results of leases
+/// that the ledger no longer knows.
+pub(crate) type Counters = LedgerStatus;
 
 /// The total that a lease is counted in when it ends.
 type Fate = fn(&mut Counters) -> &mut u64;

@@ -217,15 +217,19 @@ impl LearnerService for LearnerHandle {
     async fn checkpoint(&self, request: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointResponse>> {
         caller(&request, &[])?;
         self.check_open()?;
-        match self.shared.run_status().state() {
-            v1::RunState::Finished => Err(status::failed_precondition("the run is complete and already on disk")),
-            v1::RunState::WaitingForActors => Err(status::failed_precondition(
+        let refusal = match self.shared.run_status().state() {
+            v1::RunState::Finished => "the run is complete and already on disk",
+            v1::RunState::WaitingForActors => {
                 "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain the \
-                 learner, which writes one at once",
-            )),
-            _ => Ok(self.shared.control.request_checkpoint()),
-        }?;
-        Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.status.current_iteration() }))
+                 learner, which writes one at once"
+            }
+            _ => {
+                self.shared.control.request_checkpoint();
+                let iteration = self.shared.status.current_iteration();
+                return Ok(Response::new(v1::CheckpointResponse { iteration }));
+            }
+        };
+        Err(status::failed_precondition(refusal))
     }
 
     async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>> {

@@ -62,7 +62,7 @@ pub(crate) async fn serve(
         () = shared.control.closing.cancelled() => return,
         first = tokio::time::timeout(shared.lease_time(), inbound.message()) => first,
     };
-    let refusal = match first {
+    let answer = match first {
         Ok(Ok(Some(_))) if shared.status.finished() => Ok(run_is_complete()),
         Ok(Ok(Some(first))) => match handshake(&shared, address, first, &outbound) {
             Ok((registered, hello)) => return Session::new(shared, registered, hello, outbound).serve(inbound).await,
@@ -74,7 +74,7 @@ pub(crate) async fn serve(
         Ok(Ok(None) | Err(_)) => return,
         Err(_) => Err(Status::deadline_exceeded("hello: did not arrive in time")),
     };
-    let _ = outbound.send(refusal).await;
+    let _ = outbound.send(answer).await;
 }
 
 fn run_is_complete() -> v1::RolloutResponse {
