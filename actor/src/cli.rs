@@ -1,7 +1,7 @@
 //! The actor's command line.
 
-use crate::policy_worker::PolicyWorker;
-use crate::run::{ActorConfig, ActorError, ActorReport, run_watched};
+use crate::run::{self, ActorConfig, ActorError, ActorReport};
+use crate::worker::PolicyWorker;
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_runtime::exit::{self, Failure};
@@ -59,11 +59,11 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
     let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
         context.announce(http::routes(metrics.clone()));
-        run_watched(config, PolicyWorker::maker(), &metrics, context.stop).await.map_err(|error| match &error {
+        run::run(config, PolicyWorker::maker(), metrics, context.stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
-            ActorError::Evicted { .. } => Failure::new(exit::INTERNAL, &error),
-            ActorError::Refused { .. } | ActorError::Unusable(_) | ActorError::Worker { .. } => {
+            ActorError::Evicted(..) => Failure::new(exit::INTERNAL, &error),
+            ActorError::Refused(..) | ActorError::Unusable(_) | ActorError::Worker(..) => {
                 Failure::new(exit::UNAVAILABLE, &error)
             }
         })
@@ -74,13 +74,10 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
 }
 
 fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
-    let expected_task = match &args.config {
-        Some(path) => {
-            let named = |error: &dyn std::fmt::Display| Failure::usage(format!("{}: {error}", path.display()));
-            let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
-            Some(RunConfig::from_toml(&text).map_err(|error| named(&error))?.task.fingerprint())
-        }
-        None => None,
+    let fingerprint = |path: &PathBuf| {
+        let named = |error: &dyn std::fmt::Display| Failure::usage(format!("{}: {error}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
+        Ok(RunConfig::from_toml(&text).map_err(|error| named(&error))?.task.fingerprint())
     };
     Ok(ActorConfig {
         learner_url: args.learner.clone(),
@@ -88,7 +85,7 @@ fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
         client: args.security.read()?,
         actor_id: args.name.clone(),
         threads: args.threads,
-        expected_task,
+        expected_task: args.config.as_ref().map(fingerprint).transpose()?,
         stay: args.stay,
     })
 }

@@ -36,14 +36,9 @@ pub enum GoalError {
     Answer(String),
 }
 
-/// Assigns the goals of a shard's episodes with the weights that the shard names. Blocks.
-pub trait GoalSource {
-    /// One goal per agent of every episode.
-    fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError>;
-}
-
-/// Calls the commander service and retries while it is slow or unavailable, up to `patience`. The limit keeps a rollout thread
-/// from waiting forever for a version that the commander never gets (the learner went back to an older one).
+/// Assigns the goals of a shard's episodes with the weights that the shard names: calls the commander service and retries while
+/// it is slow or unavailable, up to `patience`. The limit keeps a rollout thread from waiting forever for a version that the
+/// commander never gets (the learner went back to an older one).
 #[derive(Debug)]
 pub struct GrpcGoals {
     runtime: Handle,
@@ -56,33 +51,29 @@ pub struct GrpcGoals {
 }
 
 impl GrpcGoals {
-    /// A client that names these weights in every request. Calls end when cancelled or after `patience`.
-    pub fn new(
+    /// A client that names these weights in every request. Calls end when cancelled or after `patience`; they are part of the
+    /// trace of `parent`.
+    pub(crate) fn new(
         runtime: Handle,
         channel: Channel,
         weights: WeightsKey,
         patience: Duration,
         cancelled: CancellationToken,
+        parent: Span,
     ) -> Self {
         let client = CommanderServiceClient::new(channel)
             .max_decoding_message_size(MAX_BATCH_BYTES)
             .max_encoding_message_size(MAX_BATCH_BYTES);
-        Self { runtime, client, weights, patience, cancelled, waited: Duration::ZERO, parent: Span::none() }
-    }
-
-    /// Makes the calls part of a trace.
-    pub(crate) fn trace(&mut self, parent: &Span) {
-        self.parent = parent.clone();
+        Self { runtime, client, weights, patience, cancelled, waited: Duration::ZERO, parent }
     }
 
     /// Total time that callers have waited for goals.
     pub(crate) fn waited(&self) -> Duration {
         self.waited
     }
-}
 
-impl GoalSource for GrpcGoals {
-    fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError> {
+    /// One goal per agent of every episode. Blocks.
+    pub fn assign(&mut self, request: &GoalRequest) -> Result<GoalReply, GoalError> {
         let message = request.to_message(&self.weights);
         let span = tracing::info_span!(target: trace::TARGET, parent: &self.parent, "goals");
         let asked = Instant::now();
@@ -115,16 +106,15 @@ async fn ask(
                 }
                 return Ok(response.into_inner());
             }
-            Ok(Err(status))
-                if !is_transient(&status)
-                    && matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied) =>
-            {
-                return Err(GoalError::Unauthorized(status.message().to_owned()));
+            Ok(Err(status)) if is_transient(&status) => status.message().to_owned(),
+            Ok(Err(status)) => {
+                return Err(match status.code() {
+                    Code::Unauthenticated | Code::PermissionDenied => {
+                        GoalError::Unauthorized(status.message().to_owned())
+                    }
+                    code => GoalError::Refused(format!("{code}: {}", status.message())),
+                });
             }
-            Ok(Err(status)) if !is_transient(&status) => {
-                return Err(GoalError::Refused(format!("{}: {}", status.code(), status.message())));
-            }
-            Ok(Err(status)) => status.message().to_owned(),
             Err(_) => "no answer in time".to_owned(),
         };
         failures += 1;

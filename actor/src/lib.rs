@@ -5,22 +5,19 @@
 //! | [`run`] | the actor's loop: connect, work, reconnect, until shutdown or the end of the run |
 //! | `session` | one connection to the learner: leases in, results out |
 //! | `rollout_pool` | the rollout threads of one run |
-//! | [`worker`] | the seam between the pool and the rollout |
-//! | [`policy_worker`] | the worker of production: the executor that the weights contain |
+//! | [`worker`] | the seam between the pool and the rollout, and the worker of production |
 //! | [`rollout`] | the rollout of one shard: a pure function of shard, seed, task, weights and goals |
 //! | [`goal_client`] | the goals of a shard, from the commander service |
-//! | `weights_feed`, [`weights_cache`] | the stream of weights, and the two latest versions |
+//! | `weights_cache` | the stream of weights, and the two latest versions |
 //! | `metrics` | the actor's Prometheus metrics |
 //! | [`cli`] | the command line of `magex-actor` |
 
 pub mod cli;
 pub mod goal_client;
 mod metrics;
-pub mod policy_worker;
 pub mod rollout;
 mod rollout_pool;
 pub mod run;
 mod session;
-pub mod weights_cache;
-mod weights_feed;
+mod weights_cache;
 pub mod worker;

@@ -5,7 +5,6 @@ use magex_core::task::TaskConfig;
 use magex_proto::v1::ShardTiming;
 use magex_runtime::metrics::{Gauge, GaugeVec, Histogram, IntCounter, IntCounterVec, Metrics};
 
-/// The metrics of an actor.
 #[derive(Debug)]
 pub(crate) struct ActorMetrics {
     shards: IntCounterVec,
@@ -31,7 +30,6 @@ const OUTCOMES: [&str; 5] = ["done", "failed", "accepted", "duplicate", "rejecte
 const QUEUES: [&str; 3] = ["shards", "unacknowledged", "outbound"];
 
 impl ActorMetrics {
-    /// Declares all of them.
     pub(crate) fn new(m: &Metrics) -> Self {
         let metrics = Self {
             shards: m.counters("magex_actor_shards_total", "Shards by outcome.", &["outcome"]),
@@ -61,7 +59,6 @@ impl ActorMetrics {
         metrics
     }
 
-    /// Counts a shard with this outcome.
     pub(crate) fn outcome(&self, outcome: &str) {
         self.shards.with_label_values(&[outcome]).inc();
     }
@@ -70,7 +67,6 @@ impl ActorMetrics {
         self.queue.with_label_values(&[name]).set(messages as f64);
     }
 
-    /// A shard was rolled out.
     pub(crate) fn done(&self, shard: &Shard, task: Option<&TaskConfig>, timing: &ShardTiming) {
         self.outcome("done");
         self.rollout.observe(timing.rollout_seconds.max(0.0));

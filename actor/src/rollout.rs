@@ -11,7 +11,7 @@ use magex_core::ids::{Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
 use magex_core::statics::Statics;
-use magex_core::task::{ActionCode, TaskConfig};
+use magex_core::task::ActionCode;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_env::{Controller, Env, EnvError, new_env, scripted};
 use magex_nets::executor::{Model, Policy};
@@ -43,19 +43,18 @@ pub enum RolloutError<E> {
     },
 }
 
-/// What drives the agents.
-enum Driver {
-    /// The executor's policy.
-    Policy(Box<dyn Policy>),
-    /// A controller without a network, made anew for every shard.
-    Controller(fn(&TaskConfig) -> Box<dyn Controller>),
+/// What drives the agents of a shard.
+enum Driver<'a> {
+    Policy(&'a dyn Policy, Carried),
+    Scripted(Box<dyn Controller>),
 }
 
 /// Everything that is the same for all shards of a version of the weights.
 pub struct Roller {
     config: RunConfig,
     model: Model,
-    driver: Driver,
+    /// `None`: the task's scripted controller drives the agents.
+    policy: Option<Box<dyn Policy>>,
 }
 
 impl std::fmt::Debug for Roller {
@@ -69,21 +68,13 @@ impl Roller {
     /// with, if the architecture allows it.
     pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         let model = Model::new(config)?;
-        let driver = Driver::Policy(model.load_policy(weights)?);
-        Ok(Self { config: config.clone(), model, driver })
+        let policy = Some(model.load_policy(weights)?);
+        Ok(Self { config: config.clone(), model, policy })
     }
 
     /// With the task's scripted controller instead of a policy (evaluation only).
     pub fn scripted(config: &RunConfig) -> Result<Self, ParamError> {
-        Self::controlled(config, scripted)
-    }
-
-    /// With a controller instead of a policy (evaluation only).
-    pub fn controlled(
-        config: &RunConfig,
-        controller: fn(&TaskConfig) -> Box<dyn Controller>,
-    ) -> Result<Self, ParamError> {
-        Ok(Self { config: config.clone(), model: Model::new(config)?, driver: Driver::Controller(controller) })
+        Ok(Self { config: config.clone(), model: Model::new(config)?, policy: None })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -106,19 +97,22 @@ impl Roller {
         let reply = assign(&request).map_err(RolloutError::Goals)?;
         state.goals = chain(&shape, &reply.goals);
         worlds.set_goals(&state.goals)?;
-        let mut controller = match &self.driver {
-            Driver::Policy(_) => None,
-            Driver::Controller(make) => Some(make(task)),
+        let mut driver = match &self.policy {
+            Some(policy) => {
+                let graph = keys.iter().map(|k| k.graph);
+                Driver::Policy(policy.as_ref(), Carried::new(&self.model, shard, n, graph))
+            }
+            None => {
+                let mut controller = scripted(task);
+                controller.begin(&state.joint_state())?;
+                Driver::Scripted(controller)
+            }
         };
-        if let Some(controller) = &mut controller {
-            controller.begin(&state.joint_state())?;
-        }
 
         let mut out = columns(&shape, shard, keep);
         let mut recording = (Vec::new(), Vec::new());
         let mut rewards = vec![0.0; b * n];
         let mut chosen = KeyedChooser::new(self.model.heads(), n, shard.mode, keys.iter().map(|k| k.action));
-        let mut carried = Carried::new(&self.model, shard, n, keys.iter().map(|k| k.graph));
         for step in 0..=steps {
             state.read(worlds.as_ref())?;
             if keep {
@@ -133,19 +127,16 @@ impl Roller {
                 break;
             }
             let mut symmetries: Vec<Symmetry> = Vec::new();
-            match (&self.driver, &mut controller) {
-                (Driver::Policy(policy), _) => {
+            match &mut driver {
+                Driver::Policy(policy, carried) => {
                     let features = self.model.spec().compute(&state.joint_state());
-                    carried.act(policy.as_ref(), &features, step, &mut chosen).map_err(ParamError::from)?;
+                    carried.act(*policy, &features, step, &mut chosen).map_err(ParamError::from)?;
                     if let Some(place) = chosen.not_finite {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
                     }
                     symmetries = features.symmetries;
                 }
-                (Driver::Controller(_), Some(controller)) => {
-                    controller.act(&state.joint_state(), &mut chosen.actions)?
-                }
-                (Driver::Controller(_), None) => {}
+                Driver::Scripted(controller) => controller.act(&state.joint_state(), &mut chosen.actions)?,
             }
             if keep {
                 out.actions.extend_from_slice(&chosen.actions);
@@ -189,15 +180,13 @@ fn to_world(code: ActionCode, heads: usize, symmetries: &[Symmetry], actions: &m
 /// What the episodes scored, and what the commander cost them.
 fn metrics(worlds: &dyn Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
     let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
-    let episodes = worlds.scores().into_iter().zip(ratios.chunks_exact(stages.max(1)));
-    let metrics = episodes.map(|(mut episode, ratios)| {
-        episode[COST_RATIO] = ratios.first().copied().unwrap_or(1.0);
-        if let Some(ratio) = ratios.get(1) {
-            episode[SECOND_COST_RATIO] = *ratio;
+    let mut episodes = worlds.scores();
+    for (episode, ratios) in episodes.iter_mut().zip(ratios.chunks_exact(stages.max(1))) {
+        for (metric, ratio) in [COST_RATIO, SECOND_COST_RATIO].into_iter().zip(ratios) {
+            episode[metric] = *ratio;
         }
-        episode
-    });
-    metrics.collect()
+    }
+    episodes
 }
 
 /// A trajectory to be filled, with room for its columns if they are kept.

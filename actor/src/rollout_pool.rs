@@ -1,22 +1,22 @@
 //! The rollout threads of one run.
 
-use crate::goal_client::{GrpcGoals, WeightsKey};
+use crate::goal_client::{GoalError, GrpcGoals, WeightsKey};
 use crate::metrics::ActorMetrics;
-use crate::weights_cache::{CacheError, WeightsCache};
-use crate::worker::{MakeWorker, Welcome, WorkError, Worker};
+use crate::weights_cache::WeightsCache;
+use crate::worker::{MakeWorker, WorkError, Worker};
 use bytes::Bytes;
 use magex_core::config::RunConfig;
-use magex_core::ids::Shard;
+use magex_core::ids::{RunId, Shard};
 use magex_core::task::TaskConfig;
 use magex_proto::convert::encode_result;
-use magex_proto::v1::ShardTiming;
+use magex_proto::v1::{ShardTiming, Welcome};
 use magex_runtime::client::Channel;
 use magex_runtime::sync::lock;
 use magex_runtime::trace;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, mpsc as blocking};
 use std::thread::JoinHandle;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -28,34 +28,28 @@ pub(crate) struct LeasedShard {
     pub(crate) lease_id: u64,
     pub(crate) shard: Shard,
     pub(crate) weights_sha256: String,
-    /// When the lease arrived.
     pub(crate) received: Instant,
     /// From the lease until the learner acknowledges the result.
     pub(crate) span: Span,
 }
 
-/// How a leased shard ended.
 #[derive(Debug)]
-pub(crate) enum ShardOutcome {
-    /// The encoded result.
-    Done { lease_id: u64, result: EncodedResult },
-    /// There is no result.
-    Failed { lease_id: u64, shard: Shard, error: WorkError },
+pub(crate) struct ShardOutcome {
+    pub(crate) lease_id: u64,
+    pub(crate) shard: Shard,
+    pub(crate) result: Result<EncodedResult, WorkError>,
 }
 
-/// An encoded result, ready to be sent.
 #[derive(Debug, Clone)]
 pub(crate) struct EncodedResult {
     pub(crate) bytes: Bytes,
     /// Where the time went; sent beside the result, never part of it.
     pub(crate) timing: ShardTiming,
-    /// When it was ready.
     pub(crate) ready: Instant,
     /// From then until the acknowledgement; ends when this is dropped.
     pub(crate) _upload: Span,
 }
 
-/// What all threads of a pool share.
 #[derive(Clone)]
 pub(crate) struct PoolContext {
     pub(crate) make_worker: MakeWorker,
@@ -68,10 +62,11 @@ pub(crate) struct PoolContext {
 /// Threads that work on one run until the pool is shut down.
 pub(crate) struct RolloutPool {
     pub(crate) welcome: Welcome,
+    /// An actor that sends nothing for this time loses its leases.
+    pub(crate) lease: Duration,
     shards: Option<blocking::SyncSender<LeasedShard>>,
     outcomes: mpsc::Receiver<ShardOutcome>,
     cancelled: CancellationToken,
-    cache: Arc<WeightsCache>,
     metrics: Arc<ActorMetrics>,
     threads: Vec<JoinHandle<()>>,
     /// Shards submitted whose outcome has not been taken.
@@ -80,21 +75,25 @@ pub(crate) struct RolloutPool {
 
 impl RolloutPool {
     /// Makes the workers and starts a thread for each. Blocks while workers are made.
-    pub(crate) fn start(welcome: Welcome, threads: usize, context: PoolContext) -> Result<Self, WorkError> {
+    pub(crate) fn start(
+        welcome: Welcome,
+        lease: Duration,
+        threads: usize,
+        context: PoolContext,
+    ) -> Result<Self, WorkError> {
         let (shards, queue) = blocking::sync_channel(2 * threads);
         let (results, outcomes) = mpsc::channel(threads);
-        let queue = Arc::new(Mutex::new(queue));
-        let cancelled = CancellationToken::new();
-        let (cache, metrics) = (context.cache.clone(), context.metrics.clone());
+        let (shards, queue) = (Some(shards), Arc::new(Mutex::new(queue)));
+        let (cancelled, metrics) = (CancellationToken::new(), context.metrics.clone());
         // Used to count steps only; the workers parse the configuration themselves and report its errors.
         let task = RunConfig::from_toml(&welcome.run_config_toml).ok().map(|config| config.task);
         metrics.threads.set(threads as f64);
-        let mut pool =
-            Self { welcome, shards: Some(shards), outcomes, cancelled, cache, metrics, threads: Vec::new(), busy: 0 };
+        let mut pool = Self { welcome, lease, shards, outcomes, cancelled, metrics, threads: Vec::new(), busy: 0 };
         for number in 0..threads {
             let rollout = RolloutThread {
                 worker: (context.make_worker)(&pool.welcome)?,
                 welcome: pool.welcome.clone(),
+                lease,
                 context: context.clone(),
                 task: task.clone(),
                 cancelled: pool.cancelled.clone(),
@@ -109,27 +108,20 @@ impl RolloutPool {
         Ok(pool)
     }
 
-    /// Rollout threads.
     pub(crate) fn threads(&self) -> usize {
         self.threads.len()
     }
 
-    /// Threads without a shard.
     pub(crate) fn idle(&self) -> usize {
         self.threads.len().saturating_sub(self.busy)
     }
 
-    /// Queues a shard for the first idle thread; returns it when the queue is full.
-    pub(crate) fn submit(&mut self, shard: LeasedShard) -> Result<(), LeasedShard> {
-        let Some(shards) = &self.shards else { return Err(shard) };
-        match shards.try_send(shard) {
-            Ok(()) => {
-                self.busy += 1;
-                self.refresh_metrics();
-                Ok(())
-            }
-            Err(blocking::TrySendError::Full(shard) | blocking::TrySendError::Disconnected(shard)) => Err(shard),
-        }
+    /// Queues a shard for the first idle thread; false if the queue is full.
+    pub(crate) fn submit(&mut self, shard: LeasedShard) -> bool {
+        let queued = self.shards.as_ref().is_some_and(|shards| shards.try_send(shard).is_ok());
+        self.busy += usize::from(queued);
+        self.refresh_metrics();
+        queued
     }
 
     /// The next outcome. Cancel safe.
@@ -162,14 +154,13 @@ impl Drop for RolloutPool {
     fn drop(&mut self) {
         self.cancelled.cancel();
         self.shards = None;
-        self.cache.wake();
     }
 }
 
-/// What one thread of the pool owns.
 struct RolloutThread {
     worker: Box<dyn Worker>,
     welcome: Welcome,
+    lease: Duration,
     context: PoolContext,
     task: Option<TaskConfig>,
     cancelled: CancellationToken,
@@ -184,10 +175,8 @@ impl RolloutThread {
             if self.cancelled.is_cancelled() {
                 return;
             }
-            let outcome = match self.roll_out(&leased) {
-                Ok(result) => ShardOutcome::Done { lease_id: leased.lease_id, result },
-                Err(error) => ShardOutcome::Failed { lease_id: leased.lease_id, shard: leased.shard, error },
-            };
+            let result = self.roll_out(&leased);
+            let outcome = ShardOutcome { lease_id: leased.lease_id, shard: leased.shard, result };
             if results.blocking_send(outcome).is_err() {
                 return;
             }
@@ -198,17 +187,18 @@ impl RolloutThread {
     fn roll_out(&mut self, leased: &LeasedShard) -> Result<EncodedResult, WorkError> {
         let begun = Instant::now();
         let span = tracing::info_span!(target: trace::TARGET, parent: &leased.span, "weights wait");
-        let run_id = self.welcome.run_id.clone();
-        let key = WeightsKey { run_id, version: leased.shard.version, sha256: leased.weights_sha256.clone() };
-        let weights = self.context.cache.wait(&key, self.welcome.lease, &self.cancelled).map_err(|error| {
-            let retryable = matches!(error, CacheError::TimedOut { .. } | CacheError::Cancelled);
-            WorkError::Failed { reason: error.to_string(), retryable }
-        })?;
+        let run_id = RunId(self.welcome.run_id.clone());
+        let sha256 = leased.weights_sha256.clone();
+        let key = WeightsKey { run_id: run_id.clone(), version: leased.shard.version, sha256 };
+        let (runtime, commander) = (self.context.runtime.clone(), self.context.commander.clone());
+        let arrival = self.context.cache.wait(&key, self.lease);
+        let arrived = runtime.block_on(self.cancelled.run_until_cancelled(arrival));
+        let cancelled = || WorkError::Retryable(GoalError::Cancelled.to_string());
+        let weights = arrived.ok_or_else(cancelled)?.map_err(|late| WorkError::Retryable(late.to_string()))?;
         drop(span);
         let weights_wait_seconds = begun.elapsed().as_secs_f64();
-        let (runtime, commander) = (self.context.runtime.clone(), self.context.commander.clone());
-        let mut goals = GrpcGoals::new(runtime, commander, key, self.welcome.lease, self.cancelled.clone());
-        goals.trace(&leased.span);
+        let (cancelled, span) = (self.cancelled.clone(), leased.span.clone());
+        let mut goals = GrpcGoals::new(runtime, commander, key, self.lease, cancelled, span);
         let working = Instant::now();
         let worker = &mut self.worker;
         let result = match catch_unwind(AssertUnwindSafe(|| worker.work(&leased.shard, &weights, &mut goals))) {
@@ -224,7 +214,7 @@ impl RolloutThread {
         }
         let worked = working.elapsed().as_secs_f64();
         let goals_wait_seconds = goals.waited().as_secs_f64();
-        let bytes = encode_result(&self.welcome.run_id, &leased.weights_sha256, &result);
+        let bytes = encode_result(&run_id, &leased.weights_sha256, &result);
         let timing = ShardTiming {
             held_seconds: leased.received.elapsed().as_secs_f64(),
             weights_wait_seconds,

@@ -4,9 +4,8 @@ use crate::metrics::ActorMetrics;
 use crate::rollout_pool::{PoolContext, RolloutPool};
 pub use crate::session::ActorReport;
 use crate::session::{self, Session, SessionEnd, UnacknowledgedResults};
-use crate::weights_cache::WeightsCache;
-use crate::weights_feed;
-use crate::worker::{MakeWorker, Welcome, WorkError};
+use crate::weights_cache::{self, WeightsCache};
+use crate::worker::{MakeWorker, WorkError};
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::{MAX_MESSAGE_BYTES, PROTOCOL_VERSION, v1};
@@ -54,50 +53,26 @@ pub enum ActorError {
     /// No rollout threads.
     #[error("threads: 0 is too few; use --threads 1 or more")]
     NoThreads,
-    /// The learner rejected this actor.
-    #[error("the learner at {url} refused: {reason}")]
-    Refused {
-        /// Address of the learner.
-        url: String,
-        /// What it said.
-        reason: String,
-    },
-    /// The learner evicted this actor process: its results are invalid, or its shards fail.
-    #[error("the learner at {url} evicted this actor: {reason}")]
-    Evicted {
-        /// Address of the learner.
-        url: String,
-        /// What it said.
-        reason: String,
-    },
+    /// The learner at this address rejected this actor, for this reason.
+    #[error("the learner at {0} refused: {1}")]
+    Refused(String, String),
+    /// The learner at this address evicted this actor process: its results are invalid, or its shards fail.
+    #[error("the learner at {0} evicted this actor: {1}")]
+    Evicted(String, String),
     /// An error that every shard would meet.
     #[error("this actor cannot process any shard: {0}")]
     Unusable(WorkError),
-    /// This build cannot work on the run.
-    #[error("cannot work on run '{run_id}': {source}")]
-    Worker {
-        /// The run.
-        run_id: String,
-        /// What is missing.
-        source: WorkError,
-    },
+    /// This build cannot work on the run of this id.
+    #[error("cannot work on run '{0}': {1}")]
+    Worker(String, #[source] WorkError),
 }
 
-/// Works until `shutdown`, or until the run is complete. An actor retries while the learner is unavailable and ends when
-/// the learner rejects or evicts it.
+/// Works until `shutdown`, or until the run is complete, and counts in `metrics`. An actor retries while the learner is
+/// unavailable and ends when the learner rejects or evicts it.
 pub async fn run(
     config: ActorConfig,
     make_worker: MakeWorker,
-    shutdown: CancellationToken,
-) -> Result<ActorReport, ActorError> {
-    run_watched(config, make_worker, &Metrics::new(), shutdown).await
-}
-
-/// [`run`], with its metrics in `metrics`.
-pub async fn run_watched(
-    config: ActorConfig,
-    make_worker: MakeWorker,
-    metrics: &Metrics,
+    metrics: Arc<Metrics>,
     shutdown: CancellationToken,
 ) -> Result<ActorReport, ActorError> {
     if config.threads == 0 {
@@ -107,10 +82,9 @@ pub async fn run_watched(
     let commander = config.client.lazy_channel(&config.commander_url)?;
     let runtime = tokio::runtime::Handle::current();
     // Two connections: results never delay weights.
-    let metrics = Arc::new(ActorMetrics::new(metrics));
+    let metrics = Arc::new(ActorMetrics::new(&metrics));
     let feed = config.client.lazy_channel(&config.learner_url)?;
-    let feed = weights_feed::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone());
-    let feed = tokio::spawn(feed);
+    let feed = tokio::spawn(weights_cache::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone()));
     let context = PoolContext { make_worker, cache, commander, runtime, metrics };
     let bulk = config.client.lazy_channel(&config.learner_url)?;
     let mut actor = Actor {
@@ -162,10 +136,10 @@ impl Actor {
                     waiting = true;
                 }
                 SessionEnd::Refused(reason) => {
-                    return Err(ActorError::Refused { url: self.config.learner_url.clone(), reason });
+                    return Err(ActorError::Refused(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Evicted(reason) => {
-                    return Err(ActorError::Evicted { url: self.config.learner_url.clone(), reason });
+                    return Err(ActorError::Evicted(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Unusable(error) => return Err(ActorError::Unusable(error)),
                 SessionEnd::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
@@ -196,7 +170,7 @@ impl Actor {
             Ok::<_, SessionEnd>((inbound, welcome))
         };
         let handshake = tokio::time::timeout(HELLO_TIMEOUT, handshake);
-        let (inbound, welcome) = match shutdown.run_until_cancelled(handshake).await {
+        let (inbound, (welcome, lease)) = match shutdown.run_until_cancelled(handshake).await {
             None => return Ok(SessionEnd::Shutdown),
             Some(Err(_)) => return Ok(SessionEnd::Broken("the learner did not answer in time".to_owned())),
             Some(Ok(Err(end))) => return Ok(end),
@@ -205,7 +179,7 @@ impl Actor {
         self.report.sessions += 1;
         let metrics = self.context.metrics.clone();
         metrics.reconnects.inc_by(u64::from(self.report.sessions > 1));
-        let pool = self.pool_for(welcome).await?;
+        let pool = self.pool_for(welcome, lease).await?;
         metrics.connected.set(1.0);
         let session =
             Session::new(self.pool.insert(pool), &mut self.unacknowledged, &mut self.report, &metrics, outbound);
@@ -225,27 +199,24 @@ impl Actor {
     }
 
     /// The pool for this run. The present pool is kept, with the shards it holds, if the run is the same.
-    async fn pool_for(&mut self, welcome: Welcome) -> Result<RolloutPool, ActorError> {
+    async fn pool_for(&mut self, welcome: v1::Welcome, lease: Duration) -> Result<RolloutPool, ActorError> {
+        let run_id = welcome.run_id.clone();
         match self.pool.take() {
             Some(pool) if pool.welcome == welcome => {
-                tracing::info!(run_id = %welcome.run_id, "reconnected");
-                Ok(pool)
+                tracing::info!(run_id, "reconnected");
+                return Ok(pool);
             }
-            old => {
-                if let Some(old) = old {
-                    tracing::info!(run_id = %welcome.run_id, "another run; discarding the work on the previous one");
-                    self.unacknowledged.clear();
-                    drop(old.shut_down());
-                }
-                tracing::info!(run_id = %welcome.run_id, threads = self.config.threads, "joined a run");
-                let run_id = welcome.run_id.0.clone();
-                let failed = |source| ActorError::Worker { run_id: run_id.clone(), source };
-                let (threads, context) = (self.config.threads, self.context.clone());
-                tokio::task::spawn_blocking(move || RolloutPool::start(welcome, threads, context))
-                    .await
-                    .map_err(|error| failed(WorkError::fatal(error.to_string())))?
-                    .map_err(failed)
+            Some(old) => {
+                tracing::info!(run_id, "another run; discarding the work on the previous one");
+                self.unacknowledged.clear();
+                drop(old.shut_down());
             }
+            None => {}
         }
+        let (threads, context) = (self.config.threads, self.context.clone());
+        tracing::info!(run_id, threads, "joined a run");
+        let started = tokio::task::spawn_blocking(move || RolloutPool::start(welcome, lease, threads, context)).await;
+        let started = started.unwrap_or_else(|error| Err(WorkError::fatal(error.to_string())));
+        started.map_err(|source| ActorError::Worker(run_id, source))
     }
 }

@@ -2,8 +2,7 @@
 
 use crate::metrics::ActorMetrics;
 use crate::rollout_pool::{EncodedResult, LeasedShard, RolloutPool, ShardOutcome};
-use crate::worker::{Welcome, WorkError};
-use magex_core::ids::RunId;
+use crate::worker::WorkError;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::{PROTOCOL_VERSION, convert, parts, v1};
@@ -18,7 +17,6 @@ use tonic::{Status, Streaming};
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 const LONGEST_LEASE: Duration = Duration::from_secs(3600);
 
-/// How a connection ends.
 #[derive(Debug)]
 pub(crate) enum SessionEnd {
     /// The actor shuts down.
@@ -63,20 +61,13 @@ pub struct ActorReport {
     pub failed: u64,
 }
 
-/// Results that the learner has not acknowledged; the next connection sends them again.
-#[derive(Debug, Default)]
-pub(crate) struct UnacknowledgedResults {
-    results: BTreeMap<u64, EncodedResult>,
-}
+/// Results that the learner has not acknowledged, by their leases; the next connection sends them again.
+pub(crate) type UnacknowledgedResults = BTreeMap<u64, EncodedResult>;
 
-impl UnacknowledgedResults {
-    pub(crate) fn clear(&mut self) {
-        self.results.clear();
-    }
-}
-
-/// Reads the learner's first message.
-pub(crate) async fn welcome(inbound: &mut Streaming<v1::RolloutResponse>) -> Result<Welcome, SessionEnd> {
+/// Reads the learner's first message, with the time after which a silent actor loses its leases.
+pub(crate) async fn welcome(
+    inbound: &mut Streaming<v1::RolloutResponse>,
+) -> Result<(v1::Welcome, Duration), SessionEnd> {
     let message =
         inbound.message().await?.ok_or_else(|| SessionEnd::Broken("the learner closed the connection".to_owned()))?;
     let welcome = match message.message {
@@ -90,13 +81,7 @@ pub(crate) async fn welcome(inbound: &mut Streaming<v1::RolloutResponse>) -> Res
         return Err(SessionEnd::Refused(format!("learner speaks protocol {theirs}, actor speaks {PROTOCOL_VERSION}")));
     }
     let lease = lease_time(welcome.lease_seconds)?;
-    Ok(Welcome {
-        run_id: RunId(welcome.run_id),
-        task_fingerprint: welcome.task_fingerprint,
-        run_config_toml: welcome.run_config_toml,
-        seed: welcome.seed,
-        lease,
-    })
+    Ok((welcome, lease))
 }
 
 /// Checks the lease time. Heartbeats cannot keep a lease outside the range that a learner can be started with.
@@ -109,7 +94,6 @@ fn lease_time(seconds: f64) -> Result<Duration, SessionEnd> {
     })
 }
 
-/// A connection after its welcome.
 pub(crate) struct Session<'a> {
     pub(crate) pool: &'a mut RolloutPool,
     pub(crate) unacknowledged: &'a mut UnacknowledgedResults,
@@ -138,18 +122,14 @@ impl<'a> Session<'a> {
         Self { pool, unacknowledged, report, metrics, outbound, urgent, bulk, credit: 0, fatal: None }
     }
 
-    /// Runs until the connection ends.
     pub(crate) async fn run(
         mut self,
         mut inbound: Streaming<v1::RolloutResponse>,
         shutdown: &CancellationToken,
     ) -> SessionEnd {
-        let again: Vec<(u64, EncodedResult)> =
-            self.unacknowledged.results.iter().map(|(id, result)| (*id, result.clone())).collect();
-        for (lease_id, result) in again {
-            self.queue_result(lease_id, &result);
-        }
-        let mut heartbeat = tokio::time::interval(self.pool.welcome.lease / 4);
+        let again = self.unacknowledged.iter().flat_map(|(&lease_id, result)| in_parts(lease_id, result));
+        self.bulk.extend(again);
+        let mut heartbeat = tokio::time::interval(self.pool.lease / 4);
         heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let outbound = self.outbound.clone();
         loop {
@@ -162,7 +142,7 @@ impl<'a> Session<'a> {
                 return SessionEnd::Unusable(error);
             }
             self.request_leases();
-            self.metrics.queue("unacknowledged", self.unacknowledged.results.len());
+            self.metrics.queue("unacknowledged", self.unacknowledged.len());
             self.metrics.queue("outbound", self.urgent.len() + self.bulk.len());
             let has_messages = !self.urgent.is_empty() || !self.bulk.is_empty();
             tokio::select! {
@@ -202,7 +182,7 @@ impl<'a> Session<'a> {
     /// Requests one lease per idle thread, unless too many results are unacknowledged.
     fn request_leases(&mut self) {
         let wanted = self.pool.idle().saturating_sub(self.credit);
-        if wanted > 0 && self.fatal.is_none() && self.unacknowledged.results.len() <= 2 * self.pool.threads() {
+        if wanted > 0 && self.fatal.is_none() && self.unacknowledged.len() <= 2 * self.pool.threads() {
             self.credit += wanted;
             self.urgent.push_back(Request::Ready(v1::Ready { credit: wanted as u32 }));
         }
@@ -216,24 +196,19 @@ impl<'a> Session<'a> {
                 Ok(())
             }
             Response::Ack(ack) => {
-                if let Some(result) = self.unacknowledged.results.remove(&ack.lease_id) {
+                if let Some(result) = self.unacknowledged.remove(&ack.lease_id) {
                     self.metrics.upload.observe(result.ready.elapsed().as_secs_f64());
                 }
-                match ack.verdict() {
-                    v1::Verdict::Accepted => {
-                        self.report.accepted += 1;
-                        self.metrics.outcome("accepted");
-                    }
-                    v1::Verdict::Duplicate => {
-                        self.report.duplicate += 1;
-                        self.metrics.outcome("duplicate");
-                    }
+                let (count, outcome) = match ack.verdict() {
+                    v1::Verdict::Accepted => (&mut self.report.accepted, "accepted"),
+                    v1::Verdict::Duplicate => (&mut self.report.duplicate, "duplicate"),
                     v1::Verdict::Rejected | v1::Verdict::Unspecified => {
-                        self.report.rejected += 1;
-                        self.metrics.outcome("rejected");
                         tracing::error!(reason = ack.reason, "the learner rejected a result");
+                        (&mut self.report.rejected, "rejected")
                     }
-                }
+                };
+                *count += 1;
+                self.metrics.outcome(outcome);
                 Ok(())
             }
             Response::Drain(drain) if drain.finished => Err(SessionEnd::Finished),
@@ -249,25 +224,24 @@ impl<'a> Session<'a> {
                 let (iteration, index) = (shard.iteration.0, shard.index);
                 let span = tracing::info_span!(target: trace::TARGET, parent: None, "rollout", iteration, index);
                 trace::continue_from(&span, &traceparent);
-                match self.pool.submit(LeasedShard { lease_id, shard, weights_sha256, received: Instant::now(), span })
-                {
-                    Ok(()) => return,
-                    // Another actor may have an idle thread.
-                    Err(_) => ("more leases than credit".to_owned(), true),
+                if self.pool.submit(LeasedShard { lease_id, shard, weights_sha256, received: Instant::now(), span }) {
+                    return;
                 }
+                // Another actor may have an idle thread.
+                ("more leases than credit".to_owned(), true)
             }
             Err(error) => (error.to_string(), false),
         };
         self.return_lease(lease_id, shard, problem, retryable);
     }
 
-    fn on_outcome(&mut self, outcome: ShardOutcome) {
-        match outcome {
-            ShardOutcome::Done { lease_id, result } => {
-                self.queue_result(lease_id, &result);
-                self.unacknowledged.results.insert(lease_id, result);
+    fn on_outcome(&mut self, ShardOutcome { lease_id, shard, result }: ShardOutcome) {
+        match result {
+            Ok(result) => {
+                self.bulk.extend(in_parts(lease_id, &result));
+                self.unacknowledged.insert(lease_id, result);
             }
-            ShardOutcome::Failed { lease_id, shard, error } => {
+            Err(error) => {
                 let (reason, retryable) = (error.to_string(), error.is_retryable());
                 tracing::warn!(reason, retryable, "returned a lease");
                 self.return_lease(lease_id, Some((&shard).into()), reason, retryable);
@@ -283,14 +257,15 @@ impl<'a> Session<'a> {
         self.metrics.outcome("failed");
         self.urgent.push_back(Request::Failed(v1::Failed { lease_id, shard, reason, retryable }));
     }
+}
 
-    fn queue_result(&mut self, lease_id: u64, result: &EncodedResult) {
-        let part = |part: v1::Part| {
-            let last = part.index + 1 == part.total;
-            Request::Part(v1::ResultPart { lease_id, part: Some(part), timing: last.then_some(result.timing) })
-        };
-        self.bulk.extend(parts::split(result.bytes.clone()).map(part));
-    }
+/// The messages of a result; the last one has its timing.
+fn in_parts(lease_id: u64, result: &EncodedResult) -> impl Iterator<Item = Request> + use<> {
+    let timing = result.timing;
+    parts::split(result.bytes.clone()).map(move |part| {
+        let last = part.index + 1 == part.total;
+        Request::Part(v1::ResultPart { lease_id, part: Some(part), timing: last.then_some(timing) })
+    })
 }
 
 /// What an error means after the welcome: the handshake is over, so an invalid argument is an invalid result.

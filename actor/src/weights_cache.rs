@@ -1,88 +1,79 @@
-//! The weights that an actor holds: the two latest arrivals, verified.
+//! The weights that an actor holds: the two latest arrivals, verified. They arrive over a connection of their own, so that bulk
+//! results never delay them.
 
+use crate::metrics::ActorMetrics;
 use magex_proto::goals::WeightsKey;
+use magex_proto::v1::SubscriberRole;
 use magex_proto::weights::Weights;
-use magex_runtime::sync::lock;
+use magex_proto::weights_watch::{OPEN_TIMEOUT, WeightsStream, late};
+use magex_runtime::backoff::Backoff;
+use magex_runtime::client::Channel;
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::{Duration, Instant};
-use tokio_util::sync::CancellationToken;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+use tonic::Status;
 
-/// Number of versions held.
 const KEPT: usize = 2;
 
-/// Why the weights are not available.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum CacheError {
-    /// They did not arrive in time.
-    #[error("weights version {wanted} did not arrive within {waited:?}; here are versions {held:?}")]
-    TimedOut {
-        /// The version waited for.
-        wanted: u32,
-        /// Time waited.
-        waited: Duration,
-        /// Versions that are held.
-        held: Vec<u32>,
-    },
-    /// The pool shuts down; the result is no longer needed.
-    #[error("cancelled: the result is no longer needed")]
-    Cancelled,
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("weights version {wanted} did not arrive within {waited:?}; here are versions {held:?}")]
+pub(crate) struct WeightsLate {
+    wanted: u32,
+    waited: Duration,
+    held: Vec<u32>,
 }
 
 /// Filled by the weights stream; rollout threads wait here for the version that their shard names.
 #[derive(Debug, Default)]
-pub struct WeightsCache {
-    held: Mutex<VecDeque<Arc<Weights>>>,
-    changed: Condvar,
-}
+pub(crate) struct WeightsCache(watch::Sender<VecDeque<Arc<Weights>>>);
 
 impl WeightsCache {
     /// Inserts weights, replaces those of the same run and version, and drops the oldest arrival.
-    pub fn insert(&self, weights: Weights) {
-        let mut held = lock(&self.held);
-        held.retain(|old| (&old.run_id, old.version) != (&weights.run_id, weights.version));
-        held.push_back(Arc::new(weights));
-        while held.len() > KEPT {
-            held.pop_front();
-        }
-        drop(held);
-        self.changed.notify_all();
+    pub(crate) fn insert(&self, weights: Weights) {
+        self.0.send_modify(|held| {
+            held.retain(|old| (&old.run_id, old.version) != (&weights.run_id, weights.version));
+            held.push_back(Arc::new(weights));
+            held.drain(..held.len().saturating_sub(KEPT));
+        });
     }
 
-    /// Returns these weights as soon as they have arrived. Blocks for at most `patience`, or until `cancelled` followed by
-    /// [`WeightsCache::wake`].
-    pub fn wait(
-        &self,
-        wanted: &WeightsKey,
-        patience: Duration,
-        cancelled: &CancellationToken,
-    ) -> Result<Arc<Weights>, CacheError> {
-        let deadline = Instant::now() + patience;
-        let mut held = lock(&self.held);
-        loop {
-            let is_wanted = |weights: &&Arc<Weights>| {
-                (&weights.run_id, weights.version, &weights.sha256) == (&wanted.run_id, wanted.version, &wanted.sha256)
-            };
-            if let Some(weights) = held.iter().find(is_wanted) {
-                return Ok(weights.clone());
-            }
-            if cancelled.is_cancelled() {
-                return Err(CacheError::Cancelled);
-            }
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() {
-                let held = held.iter().map(|weights| weights.version.0).collect();
-                return Err(CacheError::TimedOut { wanted: wanted.version.0, waited: patience, held });
-            }
-            held = self.changed.wait_timeout(held, left).unwrap_or_else(PoisonError::into_inner).0;
-        }
+    /// Returns these weights as soon as they have arrived, if they do within `patience`.
+    pub(crate) async fn wait(&self, wanted: &WeightsKey, patience: Duration) -> Result<Arc<Weights>, WeightsLate> {
+        let WeightsKey { run_id, version, sha256 } = wanted;
+        let is_wanted =
+            |weights: &&Arc<Weights>| (&weights.run_id, &weights.version, &weights.sha256) == (run_id, version, sha256);
+        let mut held = self.0.subscribe();
+        let arrival = held.wait_for(|held| held.iter().any(|weights| is_wanted(&weights)));
+        let arrived = tokio::time::timeout(patience, arrival).await.ok().and_then(Result::ok);
+        arrived.and_then(|held| held.iter().find(is_wanted).cloned()).ok_or_else(|| {
+            let held = self.0.borrow().iter().map(|weights| weights.version.0).collect();
+            WeightsLate { wanted: version.0, waited: patience, held }
+        })
     }
+}
 
-    /// Wakes all waiting threads, so that they check for cancellation.
-    pub fn wake(&self) {
-        // Taking the lock ensures that no thread is between its check and its wait.
-        drop(lock(&self.held));
-        self.changed.notify_all();
+/// Follows the learner's weights and reconnects after every failure. Never returns.
+pub(crate) async fn follow(channel: Channel, actor_id: String, cache: Arc<WeightsCache>, metrics: Arc<ActorMetrics>) {
+    let mut backoff = Backoff::default();
+    loop {
+        let arrivals = async {
+            let opening = WeightsStream::open(channel.clone(), &actor_id, SubscriberRole::Actor);
+            let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
+            while let Some((weights, _)) = stream.next().await? {
+                backoff.reset();
+                tracing::debug!(version = weights.version.0, bytes = weights.bytes.len(), "weights arrived");
+                metrics.weights_bytes.inc_by(weights.bytes.len() as u64);
+                metrics.weights_version.set(f64::from(weights.version.0));
+                cache.insert(weights);
+            }
+            Ok::<(), Status>(())
+        };
+        match arrivals.await {
+            Ok(()) => tracing::debug!("the weights stream ended"),
+            Err(status) => tracing::debug!(reason = status.message(), "the weights stream broke"),
+        }
+        tokio::time::sleep(backoff.next_wait()).await;
     }
 }
 
@@ -104,30 +95,26 @@ mod tests {
         WeightsKey { run_id, version, sha256 }
     }
 
-    #[test]
-    fn the_two_latest_are_held() {
-        let (cache, token) = (WeightsCache::default(), CancellationToken::new());
+    #[tokio::test]
+    async fn the_two_latest_are_held() {
+        let cache = WeightsCache::default();
         (1..=3).for_each(|version| cache.insert(weights(version)));
         for version in [2, 3] {
-            assert_eq!(*cache.wait(&key(&weights(version)), LONG, &token).unwrap(), weights(version));
+            assert_eq!(*cache.wait(&key(&weights(version)), LONG).await.unwrap(), weights(version));
         }
-        let error = cache.wait(&key(&weights(1)), Duration::ZERO, &token).unwrap_err();
-        assert_eq!(error, CacheError::TimedOut { wanted: 1, waited: Duration::ZERO, held: vec![2, 3] });
+        let error = cache.wait(&key(&weights(1)), Duration::ZERO).await.unwrap_err();
+        assert_eq!(error, WeightsLate { wanted: 1, waited: Duration::ZERO, held: vec![2, 3] });
         let other = WeightsKey { sha256: "another".into(), ..key(&weights(3)) };
-        assert!(cache.wait(&other, Duration::ZERO, &token).is_err());
+        assert!(cache.wait(&other, Duration::ZERO).await.is_err());
     }
 
-    #[test]
-    fn a_waiting_thread_wakes_with_the_weights_and_with_the_end() {
-        let (cache, token) = (Arc::new(WeightsCache::default()), CancellationToken::new());
-        std::thread::scope(|scope| {
-            let waiting = scope.spawn(|| cache.wait(&key(&weights(7)), LONG, &token));
-            cache.insert(weights(7));
-            assert_eq!(*waiting.join().unwrap().unwrap(), weights(7));
-            let waiting = scope.spawn(|| cache.wait(&key(&weights(8)), LONG, &token));
-            token.cancel();
-            cache.wake();
-            assert_eq!(waiting.join().unwrap(), Err(CacheError::Cancelled));
-        });
+    #[tokio::test]
+    async fn a_waiting_thread_wakes_with_the_weights() {
+        let cache = Arc::new(WeightsCache::default());
+        let (waiting, wanted) = (cache.clone(), key(&weights(7)));
+        let waiting = tokio::spawn(async move { waiting.wait(&wanted, LONG).await });
+        tokio::task::yield_now().await;
+        cache.insert(weights(7));
+        assert_eq!(*waiting.await.unwrap().unwrap(), weights(7));
     }
 }

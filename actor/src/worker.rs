@@ -1,31 +1,18 @@
-//! The seam between the rollout pool and the rollout.
+//! The seam between the rollout pool and the rollout, and the worker of production.
 
-use crate::goal_client::{GoalError, GoalSource};
-use magex_core::ids::{RunId, Shard};
+use crate::goal_client::{GoalError, GrpcGoals};
+use crate::rollout::{Roller, RolloutError};
+use magex_core::config::RunConfig;
+use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
+use magex_proto::v1::Welcome;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
-use std::time::Duration;
-
-/// What the learner tells an actor that it accepts. Together with a shard and its weights this determines every result.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Welcome {
-    /// Identity of the run.
-    pub run_id: RunId,
-    /// Fingerprint of the run's task.
-    pub task_fingerprint: String,
-    /// The run's configuration, TOML.
-    pub run_config_toml: String,
-    /// Seed of the run.
-    pub seed: u64,
-    /// An actor that sends nothing for this time loses its leases.
-    pub lease: Duration,
-}
 
 /// Turns shards into results. Belongs to one rollout thread and keeps no state that a result could depend on.
 pub trait Worker: Send {
     /// Rolls out one shard with the weights that it names.
-    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError>;
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError>;
 }
 
 /// Why a shard failed.
@@ -34,30 +21,24 @@ pub enum WorkError {
     /// The goals are not available.
     #[error("goals: {0}")]
     Goals(#[from] GoalError),
-    /// Anything else. `retryable`: another attempt may succeed.
-    #[error("{reason}")]
-    Failed {
-        /// What went wrong.
-        reason: String,
-        /// Another attempt may succeed.
-        retryable: bool,
-    },
+    /// Anything else after which another attempt may succeed.
+    #[error("{0}")]
+    Retryable(String),
+    /// A failure that every attempt would repeat.
+    #[error("{0}")]
+    Fatal(String),
 }
 
 impl WorkError {
     /// A failure that every attempt would repeat.
     pub fn fatal(reason: impl Into<String>) -> Self {
-        Self::Failed { reason: reason.into(), retryable: false }
+        Self::Fatal(reason.into())
     }
 
     /// Another attempt may succeed, here or at another actor.
     pub fn is_retryable(&self) -> bool {
-        match self {
-            Self::Goals(error) => {
-                matches!(error, GoalError::Cancelled | GoalError::Late(_) | GoalError::Unauthorized(_))
-            }
-            Self::Failed { retryable, .. } => *retryable,
-        }
+        use GoalError::{Cancelled, Late, Unauthorized};
+        matches!(self, Self::Retryable(_) | Self::Goals(Cancelled | Late(_) | Unauthorized(_)))
     }
 
     /// Every shard would fail in this way at this actor, though another actor may succeed.
@@ -66,5 +47,57 @@ impl WorkError {
     }
 }
 
-/// Creates the worker of one rollout thread. Called once per thread and run, and again after a worker panicked.
+/// Creates the worker of one rollout thread for the run of a learner. Together with a shard and its weights, the learner's
+/// welcome determines every result. Called once per thread and run, and again after a worker panicked.
 pub type MakeWorker = Arc<dyn Fn(&Welcome) -> Result<Box<dyn Worker>, WorkError> + Send + Sync>;
+
+/// Rolls out shards. Keeps the executor of the latest weights, so that each version is loaded once.
+#[derive(Debug)]
+pub struct PolicyWorker {
+    config: RunConfig,
+    /// With the SHA-256 of its weights.
+    roller: Option<(String, Roller)>,
+}
+
+impl PolicyWorker {
+    /// A worker for the run that the learner described.
+    ///
+    /// # Errors
+    /// The configuration cannot be parsed, or this build gives its task another fingerprint than the learner does.
+    pub fn new(welcome: &Welcome) -> Result<Self, WorkError> {
+        let config =
+            RunConfig::from_toml(&welcome.run_config_toml).map_err(|error| WorkError::fatal(error.to_string()))?;
+        let own = config.task.fingerprint();
+        if own != welcome.task_fingerprint {
+            return Err(WorkError::fatal(format!(
+                "task_fingerprint: the run's task is {own} to this actor and {} to the learner; use the same release on both \
+                 sides",
+                welcome.task_fingerprint
+            )));
+        }
+        Ok(Self { config, roller: None })
+    }
+
+    /// A factory of such workers.
+    pub fn maker() -> MakeWorker {
+        Arc::new(|welcome| Ok(Box::new(Self::new(welcome)?)))
+    }
+
+    fn roller(&mut self, weights: &Weights) -> Result<&Roller, WorkError> {
+        let roller = match self.roller.take() {
+            Some((sha256, roller)) if sha256 == weights.sha256 => roller,
+            _ => Roller::new(&self.config, &weights.bytes)
+                .map_err(|error| WorkError::fatal(format!("weights version {}: {error}", weights.version)))?,
+        };
+        Ok(&self.roller.insert((weights.sha256.clone(), roller)).1)
+    }
+}
+
+impl Worker for PolicyWorker {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
+        self.roller(weights)?.rollout(shard, |request| goals.assign(request)).map_err(|error| match error {
+            RolloutError::Goals(error) => WorkError::Goals(error),
+            other => WorkError::fatal(other.to_string()),
+        })
+    }
+}

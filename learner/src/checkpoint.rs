@@ -10,9 +10,9 @@ use self::disk::{Disk, FileSystem};
 use crate::train::adam::Adam;
 use crate::train::gae::ValueNorm;
 use crate::train::learned::{Learned, Network};
+use magex_core::sha256;
 use magex_nets::params::{ParamError, Params, to_safetensors};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -24,17 +24,9 @@ const FIRST_FORMAT: u32 = 1;
 /// Why a checkpoint could not be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// The file system returned an error.
-    #[error("checkpoint {path}: {error}")]
-    Io {
-        /// Which file or folder.
-        path: PathBuf,
-        /// What the system said.
-        error: std::io::Error,
-    },
-    /// A file is missing, truncated or altered.
+    /// A file or folder cannot be read or written, or a file is truncated or altered.
     #[error("checkpoint {path}: {reason}")]
-    Corrupt {
+    File {
         /// Which file or folder.
         path: PathBuf,
         /// What is wrong with it.
@@ -73,7 +65,11 @@ pub enum CheckpointError {
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// The release that writes a format.
+/// Turns what is wrong with a file or folder into the error that names it.
+fn in_file<R: ToString>(path: &Path) -> impl FnOnce(R) -> CheckpointError + use<'_, R> {
+    move |reason| CheckpointError::File { path: path.to_owned(), reason: reason.to_string() }
+}
+
 fn writer(format: u32) -> &'static str {
     match format {
         FIRST_FORMAT => "magex 0.1.0 (commit 389f705)",
@@ -106,7 +102,6 @@ struct State {
     format: u32,
     progress: Progress,
     value_norm: ValueNorm,
-    /// Updates of each network's optimiser.
     adam_steps: BTreeMap<String, u64>,
 }
 
@@ -124,12 +119,6 @@ fn moments(learned: &Learned) -> Result<Vec<u8>, ParamError> {
     to_safetensors(&named, "{\"format\":1}")
 }
 
-/// SHA-256 in lower-case hex.
-pub fn sha256_hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// What every format has in common.
 #[derive(Deserialize)]
 struct Format {
     format: u32,
@@ -166,23 +155,19 @@ pub fn write_on(
         let _ = disk.remove_dir(&temporary);
         return Err(error);
     }
-    let io = |path: &Path| {
-        let path = path.to_owned();
-        move |error| CheckpointError::Io { path, error }
-    };
     // The same iteration once more, after a resume or at a stop: the old one goes only when the new one is in its place.
     // In between it is found under its other name.
     let replaced = parent.join(format!(".{name}.old"));
     if folder.exists() {
         if replaced.exists() {
-            disk.remove_dir(&replaced).map_err(io(&replaced))?;
+            disk.remove_dir(&replaced).map_err(in_file(&replaced))?;
         }
-        disk.rename(&folder, &replaced).map_err(io(&folder))?;
+        disk.rename(&folder, &replaced).map_err(in_file(&folder))?;
     }
-    disk.rename(&temporary, &folder).map_err(io(&folder))?;
+    disk.rename(&temporary, &folder).map_err(in_file(&folder))?;
     // The renames must survive a power cut before anything older goes.
-    disk.sync(&parent).map_err(io(&parent))?;
-    let newest_first = list(run)?.into_iter().rev();
+    disk.sync(&parent).map_err(in_file(&parent))?;
+    let newest_first = list(run).into_iter().rev();
     let surplus = std::iter::once(replaced).filter(|old| old.exists()).chain(newest_first.skip(keep.max(1) as usize));
     for old in surplus {
         if let Err(error) = disk.remove_dir(&old) {
@@ -195,47 +180,34 @@ pub fn write_on(
 
 /// Everything that a checkpoint consists of, under its temporary name, safe from a power cut.
 fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
-    let io = |path: &Path| {
-        let path = path.to_owned();
-        move |error| CheckpointError::Io { path, error }
-    };
-    let unwritable = |file: &str, error: serde_json::Error| CheckpointError::Corrupt {
-        path: folder.join(file),
-        reason: error.to_string(),
-    };
     if folder.exists() {
-        disk.remove_dir(folder).map_err(io(folder))?;
+        disk.remove_dir(folder).map_err(in_file(folder))?;
     }
-    disk.create_dir(folder).map_err(io(folder))?;
+    disk.create_dir(folder).map_err(in_file(folder))?;
     let state = State {
         format: FORMAT,
         progress: progress.clone(),
         value_norm: learned.value_norm,
         adam_steps: learned.networks.iter().map(|network| (network.name.clone(), network.adam.steps)).collect(),
     };
-    let state = serde_json::to_vec_pretty(&state).map_err(|e| unwritable("state.json", e))?;
+    let state = serde_json::to_vec_pretty(&state).map_err(in_file(&folder.join("state.json")))?;
     let mut contents: Vec<(&str, Vec<u8>)> =
         FILES.into_iter().zip([learned.weights()?, moments(learned)?, state]).collect();
-    let sha256 = contents.iter().map(|(file, bytes)| ((*file).to_owned(), sha256_hex(bytes))).collect();
+    let sha256 = contents.iter().map(|(file, bytes)| ((*file).to_owned(), sha256::hex(bytes))).collect();
     let manifest = serde_json::to_vec_pretty(&Manifest { format: FORMAT, sha256 });
-    contents.push((MANIFEST, manifest.map_err(|e| unwritable(MANIFEST, e))?));
+    contents.push((MANIFEST, manifest.map_err(in_file(&folder.join(MANIFEST)))?));
     for (file, bytes) in contents {
         let path = folder.join(file);
-        disk.write(&path, &bytes).map_err(io(&path))?;
-        disk.sync(&path).map_err(io(&path))?;
+        disk.write(&path, &bytes).map_err(in_file(&path))?;
+        disk.sync(&path).map_err(in_file(&path))?;
     }
-    disk.sync(folder).map_err(io(folder))
+    disk.sync(folder).map_err(in_file(folder))
 }
 
 /// Removes what a kill left of checkpoints that were being written. No other process may be writing.
 pub fn clean(run: &Path) {
-    let Ok(entries) = fs::read_dir(run.join("checkpoints")) else { return };
-    let unfinished = |path: &Path| {
-        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        let digits = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp"));
-        digits.is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
-    };
-    for path in entries.filter_map(Result::ok).map(|entry| entry.path()).filter(|path| unfinished(path)) {
+    let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
+    for path in entries.map(|entry| entry.path()).filter(|path| hidden(path, ".tmp").is_some()) {
         if let Err(error) = fs::remove_dir_all(&path) {
             // It only takes room.
             tracing::warn!(%error, path = %path.display(), "an unfinished checkpoint cannot be removed");
@@ -244,60 +216,63 @@ pub fn clean(run: &Path) {
 }
 
 /// Checkpoint folders of a run, oldest first. Unfinished ones are not listed.
-pub fn list(run: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
-    let parent = run.join("checkpoints");
-    let Ok(entries) = fs::read_dir(&parent) else { return Ok(Vec::new()) };
-    let mut folders: Vec<(u64, bool, PathBuf)> =
-        entries.filter_map(Result::ok).filter_map(|entry| numbered(entry.path())).collect();
+pub fn list(run: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
+    let mut folders: Vec<(u64, bool, PathBuf)> = entries.filter_map(|entry| numbered(entry.path())).collect();
     folders.sort_unstable();
     // One that a kill left under its other name counts only as long as nothing is in its place.
     let names: Vec<u64> = folders.iter().filter(|(.., in_place, _)| *in_place).map(|(number, ..)| *number).collect();
     let counts = |(number, in_place, _): &(u64, bool, PathBuf)| *in_place || !names.contains(number);
-    Ok(folders.into_iter().filter(counts).map(|(.., path)| path).collect())
+    folders.into_iter().filter(counts).map(|(.., path)| path).collect()
 }
 
 /// `000012` and `.000012.old`: the number, and whether the folder is in its place.
 fn numbered(path: PathBuf) -> Option<(u64, bool, PathBuf)> {
-    let name = path.file_name()?.to_str()?;
-    let replaced = name.strip_prefix('.').and_then(|name| name.strip_suffix(".old"));
-    let digits = replaced.unwrap_or(name);
-    let number = digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())??;
+    let replaced = hidden(&path, ".old");
+    let number = replaced.or_else(|| number(path.file_name()?.to_str()?))?;
     Some((number, replaced.is_none(), path))
+}
+
+/// The number of `.000012` with an ending.
+fn hidden(path: &Path, ending: &str) -> Option<u64> {
+    number(path.file_name()?.to_str()?.strip_prefix('.')?.strip_suffix(ending)?)
+}
+
+fn number(digits: &str) -> Option<u64> {
+    digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
 /// Checks a checkpoint's hashes and reads it into networks laid out like `template`.
 pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), CheckpointError> {
-    let corrupt = |file: &str, reason: String| CheckpointError::Corrupt { path: folder.join(file), reason };
-    let load = |file: &str| {
-        fs::read(folder.join(file)).map_err(|error| CheckpointError::Io { path: folder.join(file), error })
-    };
+    let corrupt = |file: &str, reason: &str| in_file(&folder.join(file))(reason);
+    let load = |file: &str| fs::read(folder.join(file)).map_err(in_file(&folder.join(file)));
     let bytes = load(MANIFEST)?;
     // The format decides what else is in there.
-    let Format { format } = serde_json::from_slice(&bytes).map_err(|e| corrupt(MANIFEST, e.to_string()))?;
+    let Format { format } = serde_json::from_slice(&bytes).map_err(in_file(&folder.join(MANIFEST)))?;
     if format != FORMAT {
         // A flipped bit looks like another format, but only in one of two places.
         return match load("state.json").map(|state| serde_json::from_slice(&state)) {
             Ok(Ok(Format { format: FORMAT })) => {
-                Err(corrupt(MANIFEST, format!("format {format} is not that of state.json")))
+                Err(corrupt(MANIFEST, &format!("format {format} is not that of state.json")))
             }
             _ => Err(CheckpointError::Format { path: folder.to_owned(), format }),
         };
     }
-    let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|e| corrupt(MANIFEST, e.to_string()))?;
+    let manifest: Manifest = serde_json::from_slice(&bytes).map_err(in_file(&folder.join(MANIFEST)))?;
     let mut contents = Vec::new();
     for file in FILES {
         let bytes = load(file)?;
-        if manifest.sha256.get(file) != Some(&sha256_hex(&bytes)) {
-            return Err(corrupt(file, "its checksum differs from the manifest".to_owned()));
+        if manifest.sha256.get(file) != Some(&sha256::hex(&bytes)) {
+            return Err(corrupt(file, "its checksum differs from the manifest"));
         }
         contents.push(bytes);
     }
-    let state: State = serde_json::from_slice(&contents[2]).map_err(|e| corrupt("state.json", e.to_string()))?;
+    let state: State = serde_json::from_slice(&contents[2]).map_err(in_file(&folder.join("state.json")))?;
     let restore = |network: &Network| {
         let (name, entries) = (&network.name, &network.params.entries);
         let load = |bytes: &[u8], name: &str| Params::load(entries.clone(), bytes, name);
         let steps = state.adam_steps.get(name);
-        let steps = *steps.ok_or_else(|| corrupt("state.json", format!("adam_steps.{name} is missing")))?;
+        let steps = *steps.ok_or_else(|| corrupt("state.json", &format!("adam_steps.{name} is missing")))?;
         let params = load(&contents[0], name)?;
         let first = load(&contents[1], &format!("{name}.first"))?.values;
         let second = load(&contents[1], &format!("{name}.second"))?.values;
@@ -310,7 +285,7 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
 /// Rejects a run folder whose newest checkpoint has another format, before anything else in it is read: its configuration
 /// may have other keys.
 pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
-    let Some(path) = list(run)?.pop() else { return Ok(()) };
+    let Some(path) = list(run).pop() else { return Ok(()) };
     let manifest = fs::read(path.join(MANIFEST)).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
     match manifest {
         Some(Format { format: FIRST_FORMAT }) => Err(CheckpointError::Format { path, format: FIRST_FORMAT }),
@@ -326,7 +301,7 @@ pub fn read_latest(
     template: &Learned,
 ) -> Result<(Progress, Learned, Vec<CheckpointError>), CheckpointError> {
     let mut skipped = Vec::new();
-    for folder in list(run)?.iter().rev() {
+    for folder in list(run).iter().rev() {
         match read(folder, template) {
             Ok((progress, learned)) => return Ok((progress, learned, skipped)),
             Err(error @ CheckpointError::Format { .. }) => return Err(error),

@@ -4,7 +4,7 @@ use crate::checkpoint;
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::run_folder::{CONFIG_FILE, RunFolderState};
 use crate::run_identity::RunIdentity;
-use crate::serve::service::{LearnerHandle, learner_service};
+use crate::serve::service::learner_service;
 use crate::serve::validate::Limits;
 use crate::trainer::{TrainOutcome, Trainer, max_shard_episodes};
 use clap::Args;
@@ -14,15 +14,14 @@ use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
+use magex_runtime::process;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
-use magex_runtime::{process, server};
 use magex_viewer::page::{LivePage, RunInfo};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio_util::sync::CancellationToken;
 
 /// How long the trainer may take to end its iteration after a shutdown. The process may exit at any moment without damage to
 /// its checkpoints.
@@ -86,10 +85,8 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     let security = args.security.read(&args.listen)?;
-    let end = service::main("learner", 2, &args.service, async |context| {
-        train(context, &args, config, toml, lease, security).await
-    });
-    let reason = match end? {
+    let run = async |context: Context| train(context, &args, config, toml, lease, security).await;
+    let reason = match service::main("learner", 2, &args.service, run)? {
         Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
         Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
         None => "the iteration did not end in time; the last checkpoint remains valid".to_owned(),
@@ -134,7 +131,8 @@ async fn train(
         None => handle.routes(),
     };
     let page = context.announce(routes);
-    let serving = tokio::spawn(serve(handle.clone(), incoming, stop.clone()));
+    let (served, until) = (handle.clone(), stop.clone());
+    let serving = tokio::spawn(async move { served.serve(incoming, until).await });
     let (ended, training_end) = tokio::sync::oneshot::channel();
     std::thread::Builder::new()
         .name("magex-train".to_owned())
@@ -159,22 +157,18 @@ async fn train(
     }
     // Notifies the actors, ends the streams and closes the port.
     stop.cancel();
-    serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))??;
+    let served = serving.await.map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    served.map_err(|error| Failure::new(exit::INTERNAL, error))?;
     if let Some(page) = page {
         // Ends no later than the server, which has the same grace period.
         let _ = page.await;
     }
     log_ledger(&handle.status());
-    match outcome {
-        Some(Ok(outcome)) => outcome.map(Some).map_err(|error| Failure::new(exit::FAILURE, error)),
-        Some(Err(_)) => {
-            Err(Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above"))
-        }
-        None => Ok(None),
-    }
+    let Some(outcome) = outcome else { return Ok(None) };
+    let panicked = |_| Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above");
+    outcome.map_err(panicked)?.map(Some).map_err(|error| Failure::new(exit::FAILURE, error))
 }
 
-/// Logs how all leases ended.
 fn log_ledger(status: &v1::RunStatus) {
     for (counted, totals) in [("shards", &status.ledger), ("episodes", &status.episodes)] {
         let Some(b) = totals else { continue };
@@ -193,21 +187,13 @@ fn log_ledger(status: &v1::RunStatus) {
     }
 }
 
-async fn serve(handle: LearnerHandle, incoming: server::Incoming, stop: CancellationToken) -> Result<(), Failure> {
-    handle.serve(incoming, stop).await.map_err(|error| Failure::new(exit::INTERNAL, error))
-}
-
 /// The configuration in effect: flags over environment over file; when resuming, the run's own file.
 fn configure(args: &LearnerArgs) -> Result<RunConfig, Failure> {
     if args.resume {
         checkpoint::check_format(&args.out).map_err(Failure::usage)?;
     }
-    let own = args.out.join(CONFIG_FILE);
-    let path = match &args.config {
-        Some(path) => Some(path.clone()),
-        None => args.resume.then_some(own),
-    };
-    let mut config = match path {
+    let own = || args.resume.then(|| args.out.join(CONFIG_FILE));
+    let mut config = match args.config.clone().or_else(own) {
         Some(path) => {
             let named = |error: &dyn Display| Failure::usage(format!("{}: {error}", path.display()));
             let text = std::fs::read_to_string(&path).map_err(|error| named(&error))?;

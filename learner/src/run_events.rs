@@ -1,7 +1,8 @@
 //! Events of a run, and the reasons for which collecting or training ends.
 
-use magex_core::ids::{Iteration, RunId, Shard, WeightsVersion};
+use magex_core::ids::{RunId, Shard, WeightsVersion};
 use magex_nets::params::ParamError;
+use magex_proto::v1;
 use std::fmt;
 
 /// Why the learner stops before the end of the run.
@@ -23,25 +24,6 @@ impl fmt::Display for StopReason {
     }
 }
 
-/// A plan that cannot be opened.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PlanError {
-    /// There are no shards.
-    #[error("the plan has no shards")]
-    Empty,
-    /// The same shard twice.
-    #[error("the plan names shard {0} of iteration {1} twice")]
-    Repeated(u32, u32),
-    /// The previous plan is not complete.
-    #[error("a plan is open with {done} of {total} shards done")]
-    Open {
-        /// Shards done.
-        done: usize,
-        /// Shards of the plan.
-        total: usize,
-    },
-}
-
 /// Why a plan was not collected.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
@@ -56,9 +38,15 @@ pub enum CollectError {
         /// The reason of the last failure.
         reason: String,
     },
-    /// The plan is invalid.
-    #[error("plan: {0}")]
-    Plan(#[from] PlanError),
+    /// The plan has no shards.
+    #[error("plan: the plan has no shards")]
+    EmptyPlan,
+    /// The plan names this shard of this iteration twice.
+    #[error("plan: the plan names shard {0} of iteration {1} twice")]
+    Repeated(u32, u32),
+    /// The previous plan is not complete.
+    #[error("plan: a plan is open with {0} of {1} shards done")]
+    OpenPlan(usize, usize),
     /// The plan names weights that no actor can have.
     #[error("plan: names weights version {0}, which is not among the latest two that were published")]
     Version(WeightsVersion),
@@ -69,13 +57,8 @@ pub enum CollectError {
     #[error("weights: none were published before the plan")]
     NoWeights,
     /// The published weights belong to another run.
-    #[error("run_id: weights of run '{weights}' published to run '{own}'")]
-    OtherRun {
-        /// Run of the weights.
-        weights: RunId,
-        /// Run that is served.
-        own: RunId,
-    },
+    #[error("run_id: weights of run '{0}' published to run '{1}'")]
+    OtherRun(RunId, RunId),
     /// The published weights do not fit the configuration.
     #[error("weights: {0}")]
     Weights(#[from] ParamError),
@@ -84,57 +67,21 @@ pub enum CollectError {
     RolloutThread,
 }
 
-/// The name of a shard in messages.
 pub(crate) fn describe(shard: &Shard) -> String {
     format!("{:?} shard {} of iteration {}", shard.kind, shard.index, shard.iteration).to_lowercase()
 }
 
-/// Something that happened in the run.
-#[derive(Debug, Clone, PartialEq)]
-pub enum RunEvent {
-    /// An iteration was completed.
-    Iteration(IterationReport),
-    /// A message for people.
-    Log(String),
-    /// A checkpoint was written.
-    Checkpoint {
-        /// Iterations completed in it.
-        iteration: Iteration,
-        /// Where it is.
-        path: String,
-    },
-    /// The run is complete.
-    Finished {
-        /// Its summary, one JSON object on one line.
-        summary_json: String,
-    },
-}
+/// Something that happened in the run, as `WatchRun` sends it.
+pub type RunEvent = v1::watch_run_response::Event;
 
-/// Results of an iteration.
-#[derive(Debug, Clone, PartialEq)]
-pub struct IterationReport {
-    /// Iterations completed.
-    pub iteration: Iteration,
-    /// Joint steps trained on so far.
-    pub joint_env_steps: u64,
-    /// Success rate, 0..=1, if it was measured.
-    pub success: Option<f32>,
-    /// Mean reward per agent and step.
-    pub reward: Option<f32>,
-    /// All metrics, one JSON object on one line.
-    pub metrics_json: String,
-}
-
-impl IterationReport {
-    /// Parses a line of metrics.jsonl; `None` if it is not one.
-    pub(crate) fn parse(line: String) -> Option<Self> {
-        let metrics: serde_json::Value = serde_json::from_str(&line).ok()?;
-        Some(Self {
-            iteration: Iteration(u32::try_from(metrics["iteration"].as_u64()?).ok()?),
-            joint_env_steps: metrics["joint_env_steps"].as_u64()?,
-            success: metrics["success_rate"].as_f64().map(|x| x as f32),
-            reward: metrics["reward"].as_f64().map(|x| x as f32),
-            metrics_json: line,
-        })
-    }
+/// Parses a line of metrics.jsonl; `None` if it is not one.
+pub(crate) fn parse_report(line: String) -> Option<v1::IterationEvent> {
+    let metrics: serde_json::Value = serde_json::from_str(&line).ok()?;
+    Some(v1::IterationEvent {
+        iteration: u32::try_from(metrics["iteration"].as_u64()?).ok()?,
+        joint_env_steps: metrics["joint_env_steps"].as_u64()?,
+        success: metrics["success_rate"].as_f64().map(|x| x as f32),
+        reward: metrics["reward"].as_f64().map(|x| x as f32),
+        metrics_json: line,
+    })
 }

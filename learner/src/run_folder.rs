@@ -4,7 +4,6 @@ use crate::checkpoint;
 use std::fs;
 use std::path::Path;
 
-/// Name of the effective configuration in a run folder.
 pub(crate) const CONFIG_FILE: &str = "config.toml";
 
 /// What a run folder contains.
@@ -36,7 +35,7 @@ impl RunFolderState {
         if names.is_empty() {
             return Self::Empty;
         }
-        if checkpoint::list(out).is_ok_and(|checkpoints| !checkpoints.is_empty()) {
+        if !checkpoint::list(out).is_empty() {
             return Self::Run;
         }
         let has = |name: &str| names.iter().any(|own| own == name);

@@ -5,12 +5,12 @@
 pub(crate) mod control;
 pub(crate) mod events;
 pub mod grpc_collector;
-pub mod ledger;
+pub(crate) mod ledger;
 pub(crate) mod lock_order;
 pub(crate) mod metrics;
 pub mod observer;
+mod patience;
 pub(crate) mod roster;
-mod run_status;
 pub mod service;
 pub(crate) mod session;
 pub(crate) mod shared;

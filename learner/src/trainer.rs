@@ -8,22 +8,25 @@ mod saving;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
-use crate::checkpoint::{self, CheckpointError, Progress, sha256_hex};
+use crate::checkpoint::{self, CheckpointError, Progress};
 use crate::collector::Collector;
-use crate::report::means::{EvalSummary, summarise};
-use crate::report::metrics_file::{IterationMetrics, MetricsFile, Summary, Timing};
+use crate::report::means::{ClosingMeans, EvalSummary, IterationMeans, summarise};
+use crate::report::metrics_file::MetricsFile;
 use crate::report::observer::{RunObserver, RunStart};
+use crate::report::records::{IterationMetrics, Summary, Timing};
 use crate::report::tensorboard::EventFile;
-use crate::run_events::{CollectError, IterationReport, RunEvent};
+use crate::run_events::{CollectError, RunEvent, parse_report};
 use crate::train::batch::Batch;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::mappo::Mappo;
 use crate::train::stats::UpdateStats;
 use magex_core::config::RunConfig;
-use magex_core::ids::{Iteration, Mode, RunId, Shard, WeightsVersion};
+use magex_core::ids::{Mode, RunId, Shard, WeightsVersion};
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
+use magex_core::sha256;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
+use magex_proto::v1::{FinishedEvent, IterationEvent};
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
 use magex_viewer::page::{Phase, RunEnd};
@@ -50,8 +53,7 @@ pub struct Trainer {
     pool: Arc<rayon::ThreadPool>,
     /// The summary of a run that was complete when it was opened, parsed and as it is on disk.
     complete: Option<(Summary, String)>,
-    /// The last iteration of an earlier process.
-    before: Option<IterationReport>,
+    before: Option<IterationEvent>,
     /// Checkpoints that could not be written, in a row.
     failed_checkpoints: u32,
 }
@@ -76,7 +78,7 @@ impl Trainer {
         let mut trainer = Self::prepare(config, RunId(String::new()), folder, threads)?;
         let (progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
         if progress.config_sha256 != trainer.progress.config_sha256 {
-            return Err(TrainError::OtherConfiguration { folder: folder.to_owned() });
+            return Err(TrainError::OtherConfiguration(folder.to_owned()));
         }
         trainer.run_id = RunId(progress.run_id.clone());
         checkpoint::clean(folder);
@@ -85,7 +87,7 @@ impl Trainer {
             trainer.observe(MetricsFile::reopen(folder, progress.iteration)?);
             trainer.observe(EventFile::new(folder, Some(progress.joint_env_steps)));
         }
-        trainer.before = MetricsFile::last_line(folder).and_then(IterationReport::parse);
+        trainer.before = MetricsFile::last_line(folder).and_then(parse_report);
         trainer.progress = progress;
         trainer.learned = learned;
         Ok((trainer, skipped))
@@ -103,7 +105,7 @@ impl Trainer {
             .build()?;
         let progress = Progress {
             run_id: run_id.0.clone(),
-            config_sha256: config_sha256(config)?,
+            config_sha256: sha256::hex(config.to_toml()?.as_bytes()),
             iteration: 0,
             joint_env_steps: 0,
             on_target: 0,
@@ -166,7 +168,7 @@ impl Trainer {
         if let Some((summary, line)) = self.complete.take() {
             // Nothing is computed or written again; commanders and watchers that connect late are served.
             self.publish(collector)?;
-            self.event(&RunEvent::Finished { summary_json: line });
+            self.event(&RunEvent::Finished(FinishedEvent { summary_json: line }));
             return Ok(TrainOutcome::Finished(Box::new(summary)));
         }
         // A checkpoint is written after the line of its iteration, so its time counts in the next line.
@@ -264,7 +266,6 @@ impl Trainer {
         }
     }
 
-    /// Updates the executor and the commander with the iteration's trajectories.
     fn update(
         &mut self,
         trajectories: &[Trajectory],
@@ -288,7 +289,6 @@ impl Trainer {
         Ok((stats, commander))
     }
 
-    /// Reports an iteration to all observers.
     fn record(
         &mut self,
         collector: &dyn Collector,
@@ -297,27 +297,31 @@ impl Trainer {
         timing: Timing,
         updates: Option<(UpdateStats, CommanderStats)>,
     ) -> Result<(), TrainError> {
-        let metrics = IterationMetrics::new(
-            &self.config,
-            &self.progress,
-            summarise(episodes),
-            evaluation,
-            timing.attributed(collector.collected().as_ref()),
-            updates,
-            self.wall_s(),
-        );
-        let report = IterationReport {
-            iteration: Iteration(metrics.iteration),
+        let (executor, commander) = updates.unzip();
+        let steps = if episodes.is_empty() { 0.0 } else { self.config.steps_per_iteration() as f64 };
+        let metrics = IterationMetrics {
+            iteration: self.progress.iteration,
+            joint_env_steps: self.progress.joint_env_steps,
+            agent_steps: self.progress.joint_env_steps * self.config.task.agents as u64,
+            episodes: IterationMeans { greedy: evaluation, sampled: summarise(episodes) },
+            executor,
+            commander,
+            timing: timing.attributed(collector.collected().as_ref()),
+            joint_steps_per_s: steps / timing.seconds().max(1e-9),
+            wall_s: self.wall_s(),
+        };
+        let report = IterationEvent {
+            iteration: metrics.iteration,
             joint_env_steps: metrics.joint_env_steps,
             success: metrics.episodes.get(SUCCESS_RATE).map(|x| x as f32),
             reward: metrics.episodes.get(REWARD).map(|x| x as f32),
             metrics_json: serde_json::to_string(&metrics)?,
         };
         self.notify(|observer| observer.iteration(&metrics, &report));
+        self.event(&RunEvent::Iteration(report));
         Ok(())
     }
 
-    /// Seconds of training so far, over all processes of the run.
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }
@@ -336,20 +340,27 @@ impl Trainer {
         };
         let (_, outcomes) = split(results);
         self.notify(|observer| observer.evaluated(&outcomes));
-        let summary_of = |mode: Mode| {
-            summarise(outcomes.iter().filter(|o| o.shard.mode == mode).flat_map(|o| &o.metrics))
-                .ok_or(TrainError::EmptyEvaluation)
+        let means_of = |mode: Mode| {
+            let evaluation = summarise(outcomes.iter().filter(|o| o.shard.mode == mode).flat_map(|o| &o.metrics));
+            evaluation.map(|evaluation| evaluation.means).ok_or(TrainError::EmptyEvaluation)
         };
-        let weights = self.learned.weights()?;
-        let summary = Summary::new(
-            &self.config,
-            &self.progress,
-            &summary_of(Mode::Greedy)?,
-            &summary_of(Mode::Sampled)?,
-            target_reached,
+        let (greedy, sampled_success_rate) = (means_of(Mode::Greedy)?, means_of(Mode::Sampled)?[SUCCESS_RATE]);
+        let (config, joint_env_steps, weights) = (&self.config, self.progress.joint_env_steps, self.learned.weights()?);
+        let summary = Summary {
+            episodes: ClosingMeans { greedy, sampled_success_rate },
+            joint_env_steps,
+            agent_steps: joint_env_steps * config.task.agents as u64,
             wall_s,
-            sha256_hex(&weights),
-        );
+            iterations: iteration,
+            final_episodes: episodes,
+            target_reached,
+            weights_sha256: sha256::hex(&weights),
+            task: config.task.name.to_string(),
+            executor: config.executor.kind.to_string(),
+            scheduler: config.commander.kind.to_string(),
+            agents: config.task.agents,
+            seed: config.run.seed,
+        };
         let recordings: Vec<&Recording> = outcomes.iter().filter_map(|o| o.recording.as_ref()).collect();
         let (line, recordings) = (serde_json::to_string(&summary)?, serde_json::to_vec(&recordings)?);
         // The summary is written last: a reader that finds it finds the other files too.
@@ -358,7 +369,7 @@ impl Trainer {
         if let Some(reason) = self.write_last_files(collector, &files)? {
             return Ok(TrainOutcome::Stopped(reason));
         }
-        self.event(&RunEvent::Finished { summary_json: line });
+        self.event(&RunEvent::Finished(FinishedEvent { summary_json: line }));
         Ok(TrainOutcome::Finished(Box::new(summary)))
     }
 }
@@ -367,22 +378,16 @@ impl Trainer {
 fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option<(Summary, String)>, TrainError> {
     let Ok(line) = std::fs::read_to_string(folder.join("summary.json")) else { return Ok(None) };
     let Ok(summary) = serde_json::from_str::<Summary>(&line) else { return Ok(None) };
-    let same = summary.iterations == iteration && summary.weights_sha256 == sha256_hex(&learned.weights()?);
+    let same = summary.iterations == iteration && summary.weights_sha256 == sha256::hex(&learned.weights()?);
     Ok(same.then_some((summary, line)))
 }
 
-/// SHA-256 of everything that determines a run's numbers.
-fn config_sha256(config: &RunConfig) -> Result<String, TrainError> {
-    Ok(sha256_hex(config.to_toml()?.as_bytes()))
-}
-
+/// Training results and evaluations, each in the order of the plan.
 fn split(results: Vec<ShardResult>) -> (Vec<Trajectory>, Vec<EvalOutcome>) {
     let (mut trajectories, mut outcomes) = (Vec::new(), Vec::new());
-    for result in results {
-        match result {
-            ShardResult::Train(trajectory) => trajectories.push(trajectory),
-            ShardResult::Eval(outcome) => outcomes.push(outcome),
-        }
-    }
+    results.into_iter().for_each(|result| match result {
+        ShardResult::Train(trajectory) => trajectories.push(trajectory),
+        ShardResult::Eval(outcome) => outcomes.push(outcome),
+    });
     (trajectories, outcomes)
 }

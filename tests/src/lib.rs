@@ -7,7 +7,7 @@ pub mod proxy;
 pub mod relay;
 pub mod sandbox;
 
-use magex::local::{EventChannel, LocalCollector};
+use magex::local::LocalCollector;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
@@ -59,11 +59,11 @@ pub fn train(config: &RunConfig, folder: &Path, actors: usize, threads: usize) -
 /// Drives a trainer to its end or until `stop` is set.
 pub fn drive(mut trainer: Trainer, config: &RunConfig, actors: usize, stop: &Arc<AtomicBool>) -> Ran {
     let (sender, receiver): (_, Receiver<RunEvent>) = channel();
-    trainer.observe(EventChannel(sender));
+    trainer.observe(sender);
     let mut collector = LocalCollector::new(config, actors, stop.clone());
     let outcome = trainer.run(&mut collector).expect("training");
     let learned = trainer.learned();
-    let sha256 = magex_learner::checkpoint::sha256_hex(&learned.weights().expect("weights"));
+    let sha256 = magex_core::sha256::hex(&learned.weights().expect("weights"));
     // The channel ends with its sender.
     drop(trainer);
     Ran { outcome, sha256, events: receiver.iter().collect() }

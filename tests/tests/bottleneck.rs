@@ -1,10 +1,9 @@
 //! Each part of the cluster is slowed down in turn, and the reported bottleneck follows.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_actor::goal_client::GoalSource;
-use magex_actor::policy_worker::PolicyWorker;
+use magex_actor::goal_client::GrpcGoals;
 use magex_actor::run::ActorConfig;
-use magex_actor::worker::{MakeWorker, WorkError, Worker};
+use magex_actor::worker::{MakeWorker, PolicyWorker, WorkError, Worker};
 use magex_commander::run_scheduler::load_scheduler;
 use magex_commander::service::ServiceConfig;
 use magex_core::config::{ExecutorKind, RunConfig};
@@ -58,7 +57,7 @@ struct Late {
 }
 
 impl Worker for Late {
-    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         std::thread::sleep(self.delay);
         self.worker.work(shard, weights, goals)
     }
@@ -105,7 +104,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
             client: Default::default(),
             stay: false,
         };
-        tokio::spawn(magex_actor::run::run(actor, late(delay), stop.clone()));
+        tokio::spawn(magex_actor::run::run(actor, late(delay), Arc::default(), stop.clone()));
     });
     trainer.run(&mut collector).unwrap();
     stop.cancel();
@@ -120,7 +119,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
     let stages = trained.map(|line| line["timing"]["bottleneck"]["stage"].as_str().unwrap().to_owned()).collect();
     let weights = trainer.learned().weights().unwrap();
     runtime.shutdown_background();
-    (stages, magex_learner::checkpoint::sha256_hex(&weights))
+    (stages, magex_core::sha256::hex(&weights))
 }
 
 /// Most of the iterations say so: what else runs on the machine may blur one.

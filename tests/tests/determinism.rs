@@ -10,10 +10,11 @@ use magex_core::task::TaskName;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint;
 use magex_learner::collector::Collector;
-use magex_learner::report::metrics_file::{IterationMetrics, Summary};
 use magex_learner::report::observer::{RunObserver, RunStart};
-use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use magex_learner::report::records::{IterationMetrics, Summary};
+use magex_learner::run_events::{CollectError, RunEvent, StopReason};
 use magex_learner::trainer::{EVAL_SET_TRAINING, TrainOutcome, Trainer};
+use magex_proto::v1::IterationEvent;
 use magex_proto::weights::Weights;
 use magex_tests::{drive, small, small_task, train, updates};
 use magex_viewer::page::{Phase, RunEnd};
@@ -110,7 +111,7 @@ fn after_a_corrupt_checkpoint_the_previous_one_leads_to_the_same_bits() {
     let config = small(ExecutorKind::Local, 5, 5);
     let folder = tempfile::tempdir().unwrap();
     let whole = train(&config, folder.path(), 1, 1).sha256;
-    let checkpoints = checkpoint::list(folder.path()).unwrap();
+    let checkpoints = checkpoint::list(folder.path());
     let newest = checkpoints.last().unwrap().join("weights.safetensors");
     let mut bytes = std::fs::read(&newest).unwrap();
     let last = bytes.len() - 1;
@@ -294,7 +295,7 @@ impl RunObserver for Witness {
         self.call(format!("{phase:?}"));
     }
 
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         let lines = std::fs::read_to_string(self.folder.join("metrics.jsonl")).unwrap();
         let written = lines.lines().next_back() == Some(&report.metrics_json);
         self.call(format!("iteration {} {}", report.iteration, if written { "on disk" } else { "not on disk" }));
@@ -302,8 +303,9 @@ impl RunObserver for Witness {
 
     fn event(&mut self, event: &RunEvent) {
         match event {
-            RunEvent::Checkpoint { iteration, .. } => self.call(format!("checkpoint {iteration}")),
-            RunEvent::Finished { .. } => self.call("finished"),
+            RunEvent::Iteration(_) => {}
+            RunEvent::Checkpoint(checkpoint) => self.call(format!("checkpoint {}", checkpoint.iteration)),
+            RunEvent::Finished(_) => self.call("finished"),
             other => self.call(format!("{other:?}")),
         }
     }

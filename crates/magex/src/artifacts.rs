@@ -29,7 +29,6 @@ pub(crate) fn write_curve(folder: &Path, config: &RunConfig) -> anyhow::Result<(
     write(&folder.join("curve.svg"), svg.as_bytes())
 }
 
-/// Writes a replay page.
 pub(crate) fn write_replay(
     path: &Path,
     title: &str,
@@ -60,7 +59,6 @@ pub(crate) fn write_recorded_replay(folder: &Path, config: &RunConfig) -> anyhow
     write_replay(&folder.join("replay.html"), &run_name(folder), &subtitle, config, &episodes)
 }
 
-/// Name of the run: that of its folder.
 pub(crate) fn run_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
 }

@@ -1,7 +1,7 @@
 //! Evaluation in this process: shards of whole episodes on spawns that training never saw.
 
 use crate::failure::usage;
-use crate::folder::Trained;
+use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
@@ -9,12 +9,12 @@ use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
+use std::path::PathBuf;
 
 /// Evaluation set of `magex eval` unless another is named.
-pub(crate) const EVAL_SET: u32 = 100;
+const EVAL_SET: u32 = 100;
 /// Limit of agents per shard, unless a single episode has more: bounds the memory of a rollout.
 const AGENTS_PER_SHARD: usize = 800;
-/// Limit of episodes per shard.
 const EPISODES_PER_SHARD: u32 = 16;
 
 /// What chooses the actions.
@@ -27,7 +27,6 @@ pub(crate) enum Controller {
     Scripted,
 }
 
-/// How actions and goals are chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Modes {
     /// The most likely action, goal and edges.
@@ -39,7 +38,6 @@ pub(crate) enum Modes {
 }
 
 impl Modes {
-    /// The modes, greedy first.
     pub(crate) fn list(self) -> &'static [Mode] {
         match self {
             Self::Greedy => &[Mode::Greedy],
@@ -49,11 +47,36 @@ impl Modes {
     }
 }
 
-/// The name of a mode.
 pub(crate) fn mode_name(mode: Mode) -> &'static str {
     match mode {
         Mode::Greedy => "greedy",
         Mode::Sampled => "sampled",
+    }
+}
+
+/// A run, and the starts on which it is evaluated.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct Subject {
+    /// Run folder, or a weights file together with --config.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: PathBuf,
+    /// Configuration of a weights file.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Evaluation set: selects the starts; 3 or more.
+    #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = eval_set)]
+    pub(crate) eval_set: u32,
+    #[command(flatten)]
+    pub(crate) vary: Variation,
+}
+
+impl Subject {
+    /// Loads the run, with its configuration as it is evaluated.
+    pub(crate) fn load(&self) -> anyhow::Result<(Trained, RunConfig)> {
+        let trained = folder::load(&self.run, self.config.as_deref())?;
+        trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
+        let config = self.vary.apply(&trained)?;
+        Ok((trained, config))
     }
 }
 
@@ -80,20 +103,18 @@ pub(crate) struct Variation {
 
 impl Variation {
     /// The run's configuration as it is evaluated.
-    pub(crate) fn apply(&self, trained: &Trained) -> anyhow::Result<RunConfig> {
+    fn apply(&self, trained: &Trained) -> anyhow::Result<RunConfig> {
         let mut config = trained.config.clone();
         if let Some(agents) = self.agents.filter(|&agents| agents != config.task.agents) {
             let own = config.task.agents;
             let (executor, scheduler) = (config.executor.kind, self.scheduler_of(&config));
-            let fixed = if executor.fixed_team_size() && self.controller == Controller::Learned {
-                Some((format!("the {executor} executor"), ""))
-            } else if scheduler.fixed_team_size() {
-                Some((format!("the {scheduler} scheduler"), "; use --scheduler exact"))
-            } else {
-                None
-            };
-            if let Some((part, remedy)) = fixed {
-                return Err(usage(format!("--agents {agents}: {part} of this run was built for {own} agents{remedy}")));
+            let built_for = format!("of this run was built for {own} agents");
+            if executor.fixed_team_size() && self.controller == Controller::Learned {
+                return Err(usage(format!("--agents {agents}: the {executor} executor {built_for}")));
+            }
+            if scheduler.fixed_team_size() {
+                let remedy = "use --scheduler exact";
+                return Err(usage(format!("--agents {agents}: the {scheduler} scheduler {built_for}; {remedy}")));
             }
             config.task = config.task.resized(agents);
         }
@@ -110,7 +131,6 @@ impl Variation {
         Ok(config.validated()?)
     }
 
-    /// The policy to evaluate.
     pub(crate) fn policy(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<LoadedPolicy> {
         let roller = match self.controller {
             Controller::Learned => Roller::new(config, weights)?,
@@ -120,27 +140,22 @@ impl Variation {
         Ok(LoadedPolicy { roller, commander, random_assignment_fraction: 0.0 })
     }
 
-    /// The scheduler that assigns the goals.
     pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderPolicy {
         self.scheduler.unwrap_or(config.commander.kind)
     }
 }
 
-/// Which episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Episodes {
-    /// How many.
     pub(crate) count: u32,
-    /// Evaluation set.
     pub(crate) set: u32,
-    /// How actions and goals are chosen.
     pub(crate) mode: Mode,
     /// Number of episodes to record, from the first.
     pub(crate) record: u32,
 }
 
 /// Parses an evaluation set; the sets that training uses are rejected.
-pub(crate) fn eval_set(text: &str) -> Result<u32, String> {
+fn eval_set(text: &str) -> Result<u32, String> {
     let first = EVAL_SET_TRAINING.max(EVAL_SET_FINAL) + 1;
     match text.parse() {
         Ok(set) if set >= first => Ok(set),

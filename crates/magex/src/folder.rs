@@ -12,7 +12,8 @@
 use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
-use magex_learner::checkpoint::{self, CheckpointError, sha256_hex};
+use magex_core::sha256;
+use magex_learner::checkpoint::{self, CheckpointError};
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
 use magex_learner::train::mappo::Mappo;
@@ -20,7 +21,6 @@ use std::path::{Path, PathBuf};
 
 /// The effective configuration.
 pub const CONFIG: &str = "config.toml";
-/// The result of a finished run.
 pub(crate) const SUMMARY: &str = "summary.json";
 /// The trained networks.
 pub const WEIGHTS: &str = "weights.safetensors";
@@ -96,7 +96,7 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
         };
         let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
         let config = crate::settings::read(Some(config))?;
-        let (sha256, name) = (sha256_hex(&weights), path.display().to_string());
+        let (sha256, name) = (sha256::hex(&weights), path.display().to_string());
         return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new() });
     }
     if !path.is_dir() {
@@ -108,7 +108,7 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
     let config = config_of(path)?;
     let (weights, notes) = weights_of(path, &config)?;
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
-    Ok(Trained { config, sha256: sha256_hex(&weights), weights, name, folder: Some(path.to_owned()), notes })
+    Ok(Trained { config, sha256: sha256::hex(&weights), weights, name, folder: Some(path.to_owned()), notes })
 }
 
 /// The final weights if they exist and are intact, otherwise those of the newest usable checkpoint.
@@ -119,7 +119,7 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
         .and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok())
         .and_then(|summary| summary["weights_sha256"].as_str().map(str::to_owned));
     match (std::fs::read(folder.join(WEIGHTS)), expected) {
-        (Ok(bytes), Some(expected)) if sha256_hex(&bytes) == expected => return Ok((bytes, notes)),
+        (Ok(bytes), Some(expected)) if sha256::hex(&bytes) == expected => return Ok((bytes, notes)),
         (Ok(_), Some(_)) => notes.push(format!("{WEIGHTS} is corrupt (its checksum differs from {SUMMARY})")),
         (Err(_), Some(_)) => notes.push(format!("{WEIGHTS} is missing")),
         (_, None) => notes.push("the run is not finished".to_owned()),
@@ -134,10 +134,8 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
 
 /// `checkpoint 000010 is corrupt (weights.safetensors: its checksum differs from the manifest)`
 pub(crate) fn what_is_wrong(error: &CheckpointError) -> String {
-    let (path, reason) = match error {
-        CheckpointError::Corrupt { path, reason } => (path, reason.clone()),
-        CheckpointError::Io { path, error } => (path, error.to_string()),
-        other => return format!("a checkpoint is corrupt ({other})"),
+    let CheckpointError::File { path, reason } = error else {
+        return format!("a checkpoint is corrupt ({error})");
     };
     let text = |part: Option<&std::ffi::OsStr>| part.map(|p| p.to_string_lossy().into_owned()).unwrap_or_default();
     let checkpoint = text(path.parent().and_then(Path::file_name));
@@ -146,8 +144,7 @@ pub(crate) fn what_is_wrong(error: &CheckpointError) -> String {
 
 /// The checkpoint that a resumed run continues from when the newest `skipped` ones are unusable.
 pub(crate) fn continues_from(folder: &Path, skipped: usize) -> Option<String> {
-    let folders = checkpoint::list(folder).ok()?;
-    folders.iter().rev().nth(skipped)?.file_name().map(|name| name.to_string_lossy().into_owned())
+    checkpoint::list(folder).iter().rev().nth(skipped)?.file_name().map(|name| name.to_string_lossy().into_owned())
 }
 
 #[cfg(test)]
@@ -183,7 +180,7 @@ mod tests {
 
     #[test]
     fn corrupt_checkpoints_are_named() {
-        let error = CheckpointError::Corrupt {
+        let error = CheckpointError::File {
             path: "runs/x/checkpoints/000010/state.json".into(),
             reason: "its checksum differs from the manifest".into(),
         };

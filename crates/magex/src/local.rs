@@ -7,30 +7,23 @@ use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use magex_learner::collector::Collector;
-use magex_learner::report::metrics_file::IterationMetrics;
-use magex_learner::report::observer::RunObserver;
-use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use magex_learner::run_events::{CollectError, StopReason};
 use magex_nets::commander::Commander;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::Sender;
 
 /// One version of the weights, loaded for rollouts.
 #[derive(Debug)]
-pub struct LoadedPolicy {
-    /// Chooses the actions.
-    pub roller: Roller,
-    /// Assigns the goals.
-    pub commander: Commander,
-    /// Share of the training episodes with random goals.
-    pub random_assignment_fraction: f32,
+pub(crate) struct LoadedPolicy {
+    pub(crate) roller: Roller,
+    pub(crate) commander: Commander,
+    pub(crate) random_assignment_fraction: f32,
 }
 
 impl LoadedPolicy {
-    /// Loads executor and commander from a weights file.
-    pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
+    fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         Ok(Self {
             roller: Roller::new(config, weights)?,
             commander: commander(config, weights, None)?,
@@ -38,19 +31,15 @@ impl LoadedPolicy {
         })
     }
 
-    /// Rolls out one shard.
-    fn rollout(&self, shard: &Shard) -> Result<ShardResult, CollectError> {
-        self.roller
-            .rollout(shard, |request| answer(&self.commander, self.random_assignment_fraction, request, &|| true))
-            .map_err(|e| CollectError::Shard { shard: *shard, reason: e.to_string() })
-    }
-
     /// Rolls out a plan on `threads` threads; the results are in the order of the plan.
-    pub fn rollout_all(&self, plan: &[Shard], threads: usize) -> Result<Vec<ShardResult>, CollectError> {
-        parallel::in_order(threads, plan.len(), |index| self.rollout(&plan[index]))
-            .map_err(|_| CollectError::RolloutThread)?
-            .into_iter()
-            .collect()
+    pub(crate) fn rollout_all(&self, plan: &[Shard], threads: usize) -> Result<Vec<ShardResult>, CollectError> {
+        let goals = |request: &_| answer(&self.commander, self.random_assignment_fraction, request, &|| true);
+        let rollout = |index: usize| {
+            let result = self.roller.rollout(&plan[index], goals);
+            result.map_err(|error| CollectError::Shard { shard: plan[index], reason: error.to_string() })
+        };
+        let results = parallel::in_order(threads, plan.len(), rollout).map_err(|_| CollectError::RolloutThread)?;
+        results.into_iter().collect()
     }
 }
 
@@ -101,19 +90,5 @@ impl Collector for LocalCollector {
 
     fn stop_requested(&self) -> Option<StopReason> {
         self.stop.load(Ordering::Relaxed).then_some(StopReason::Shutdown)
-    }
-}
-
-/// Sends the events of a run to another thread. Events after the receiver is gone are dropped.
-#[derive(Debug)]
-pub struct EventChannel(pub Sender<RunEvent>);
-
-impl RunObserver for EventChannel {
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
-        self.event(&RunEvent::Iteration(report.clone()));
-    }
-
-    fn event(&mut self, event: &RunEvent) {
-        let _ = self.0.send(event.clone());
     }
 }

@@ -1,23 +1,22 @@
 //! Log lines on standard error, above the live status line of a terminal.
 
 use indicatif::ProgressBar;
+use magex_runtime::sync::lock;
 use magex_runtime::telemetry::LogFormat;
 use std::io::{IsTerminal as _, Write};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 use tracing_subscriber::EnvFilter;
-use tracing_subscriber::fmt::MakeWriter;
 
-/// The status line on the screen.
 static LIVE: Mutex<Option<ProgressBar>> = Mutex::new(None);
 
 /// Sets or removes the status line.
 pub(crate) fn set_live_line(bar: Option<ProgressBar>) {
-    *LIVE.lock().unwrap_or_else(PoisonError::into_inner) = bar;
+    *lock(&LIVE) = bar;
 }
 
 /// Hides the status line while `write` prints to standard error.
 pub(crate) fn around_live_line(write: impl FnOnce()) {
-    let live = LIVE.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    let live = lock(&LIVE).clone();
     match live {
         Some(bar) => bar.suspend(write),
         None => write(),
@@ -32,7 +31,7 @@ pub(crate) fn init(format: LogFormat, verbose: u8) {
         _ => "trace",
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(Lines);
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(|| Line);
     // A second call has no effect.
     let _ = match format {
         LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).with_target(false).try_init(),
@@ -40,15 +39,7 @@ pub(crate) fn init(format: LogFormat, verbose: u8) {
     };
 }
 
-struct Lines;
-
-impl<'a> MakeWriter<'a> for Lines {
-    type Writer = Line;
-    fn make_writer(&'a self) -> Line {
-        Line
-    }
-}
-
+/// Standard error, above the status line.
 struct Line;
 
 impl Write for Line {

@@ -43,7 +43,6 @@ pub fn note(text: impl AsRef<str>) {
     });
 }
 
-/// Whether standard error shows colours.
 pub(crate) fn colours() -> bool {
     std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none()
 }
@@ -73,33 +72,19 @@ impl std::fmt::Display for Table {
         let width = |c: usize| self.rows.iter().filter_map(|r| r.get(c)).map(|x| x.chars().count()).max().unwrap_or(0);
         let widths: Vec<usize> = (0..columns).map(width).collect();
         for (index, row) in self.rows.iter().enumerate() {
-            let mut line = String::new();
-            for (column, cell) in row.iter().enumerate() {
-                let width = widths[column];
-                let gap = if column == 0 { "  " } else { "   " };
-                line += gap;
-                line += &if column < self.left { format!("{cell:<width$}") } else { format!("{cell:>width$}") };
-            }
-            f.write_str(line.trim_end())?;
-            if index + 1 < self.rows.len() {
-                f.write_str("\n")?;
-            }
+            let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| {
+                if column < self.left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
+            });
+            let end = if index == 0 { "" } else { "\n" };
+            write!(f, "{end}  {}", cells.collect::<Vec<_>>().join("   ").trim_end())?;
         }
         Ok(())
     }
 }
 
-/// 12345.6 → `12,346`.
+/// 12345.6 → `12,346`; at least zero.
 pub fn thousands(value: f64) -> String {
-    let digits = format!("{:.0}", value.abs());
-    let mut out = String::new();
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(digit);
-    }
-    if value < 0.0 && digits != "0" { format!("-{out}") } else { out }
+    indicatif::HumanCount(value.round_ties_even() as u64).to_string()
 }
 
 /// A span of time.

@@ -10,7 +10,6 @@ pub(crate) const OPTION: &str = "stop-with-stdin";
 /// A service that received the stop signal exits within this time.
 const GRACE: Duration = Duration::from_secs(8);
 
-/// The hidden option.
 #[derive(Debug, Clone, Copy, clap::Args)]
 pub(crate) struct ParentWatch {
     /// Stop when standard input ends.
@@ -19,7 +18,6 @@ pub(crate) struct ParentWatch {
 }
 
 impl ParentWatch {
-    /// Starts the watch if the option was given.
     pub(crate) fn start(self) -> Result<(), Failure> {
         if !self.enabled {
             return Ok(());

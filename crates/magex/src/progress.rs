@@ -13,7 +13,6 @@ use serde_json::Value;
 use std::io::IsTerminal as _;
 use std::time::{Duration, Instant};
 
-/// Rows between two headings of the table.
 const PAGE: u32 = 40;
 
 /// The part of a line of metrics.jsonl that is shown.
@@ -30,17 +29,13 @@ struct Row {
 }
 
 impl Row {
-    fn get(&self, column: &str) -> Option<f64> {
-        self.columns.get(column)?.as_f64()
-    }
-
     /// A metric under its name in metrics.jsonl.
     fn metric(&self, metric: usize) -> Option<f64> {
-        self.get(METRICS[metric].name)
+        self.columns.get(METRICS[metric].name)?.as_f64()
     }
 
     fn sampled(&self, metric: usize) -> Option<f64> {
-        self.get(METRICS[metric].sampled?)
+        self.columns.get(METRICS[metric].sampled?)?.as_f64()
     }
 }
 
@@ -61,26 +56,26 @@ impl Shares {
     }
 }
 
-/// Shows the progress of a run.
 pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     rows: u32,
     target: f64,
-    /// The metrics that have a column.
     metrics: Vec<usize>,
     colours: bool,
-    last_iteration: Option<Instant>,
-    page: Option<String>,
+    /// Time at which the last iteration was reported.
+    pub(crate) last_iteration: Option<Instant>,
+    /// Address of the live page, if there is one.
+    pub(crate) page: Option<String>,
 }
 
 impl Progress {
-    /// Announces the run.
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
         let target = f64::from(config.run.target_success);
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
         let metrics = (0..METRICS.len()).filter(shown).collect();
-        let terminal = std::io::stderr().is_terminal();
-        if !terminal {
+        let mut progress =
+            Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
+        if !std::io::stderr().is_terminal() {
             tracing::info!(
                 out,
                 task = %config.task.name,
@@ -93,10 +88,10 @@ impl Progress {
                 target_success = rounded(target),
                 "training"
             );
-            return Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
+            return progress;
         }
-        let colours = colours();
-        let [bold, plain] = if colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
+        progress.colours = colours();
+        let [bold, plain] = if progress.colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
         note(format!("{bold}{}{plain}", crate::artifacts::describe(config)));
         note(format!("{title} · {out}\n"));
         let bar = ProgressBar::with_draw_target(Some(config.run.max_steps), ProgressDrawTarget::stderr_with_hz(10));
@@ -107,10 +102,10 @@ impl Progress {
         bar.set_message("waiting for the first iteration");
         bar.enable_steady_tick(Duration::from_millis(100));
         set_live_line(Some(bar.clone()));
-        Self { bar: Some(bar), rows: 0, target, metrics, colours, last_iteration: None, page: None }
+        progress.bar = Some(bar);
+        progress
     }
 
-    /// Shows an event of the run.
     pub(crate) fn event(&mut self, event: &RunEvent) {
         match event {
             RunEvent::Iteration(report) => match serde_json::from_str::<Row>(&report.metrics_json) {
@@ -121,17 +116,11 @@ impl Progress {
                 Err(error) => tracing::warn!(%error, "the metrics of an iteration are malformed"),
             },
             RunEvent::Log(text) => tracing::info!("{text}"),
-            RunEvent::Checkpoint { iteration, path } => tracing::debug!(%iteration, path, "checkpoint"),
-            RunEvent::Finished { .. } => self.status("finished"),
+            RunEvent::Checkpoint(e) => tracing::debug!(iteration = e.iteration, path = e.path, "checkpoint"),
+            RunEvent::Finished(_) => self.status("finished"),
         }
     }
 
-    /// Time at which the last iteration was reported.
-    pub(crate) fn last_iteration(&self) -> Option<Instant> {
-        self.last_iteration
-    }
-
-    /// Shows the address of the live page.
     pub(crate) fn page(&mut self, address: &str) {
         let url = format!("http://{address}/");
         match &self.bar {
@@ -141,19 +130,12 @@ impl Progress {
         self.page = Some(url);
     }
 
-    /// Address of the live page, if there was one.
-    pub(crate) fn page_url(&self) -> Option<&str> {
-        self.page.as_deref()
-    }
-
-    /// Sets the text of the status line.
     pub(crate) fn status(&self, text: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(text.to_owned());
         }
     }
 
-    /// Removes the status line.
     pub(crate) fn end(&mut self) {
         set_live_line(None);
         if let Some(bar) = self.bar.take() {
@@ -208,7 +190,6 @@ impl Drop for Progress {
     }
 }
 
-/// Width of a metric's column.
 fn width(metric: usize) -> usize {
     METRICS[metric].label.len().max(6)
 }

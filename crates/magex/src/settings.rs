@@ -66,17 +66,10 @@ pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     serde_json::from_value(text.into()).map_err(|error| error.to_string().replace("unknown variant", "unknown name"))
 }
 
-/// Cores of this machine.
-pub(crate) fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
-}
-
-/// Parses a number of threads.
 pub(crate) fn threads(text: &str) -> Result<usize, String> {
     within(text, 1024).map(|count| count as usize)
 }
 
-/// Parses a number of actors.
 pub(crate) fn actors(text: &str) -> Result<usize, String> {
     within(text, 256).map(|count| count as usize)
 }

@@ -8,11 +8,9 @@ pub mod service;
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
-use magex_core::ids::Iteration;
-use magex_learner::run_events::{IterationReport, RunEvent};
+use magex_learner::run_events::RunEvent;
 use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
-use magex_proto::v1::watch_run_response::Event;
 use magex_runtime::{client, exit, shutdown};
 use service::{Service, code_of, keep};
 use std::path::Path;
@@ -24,7 +22,6 @@ use tokio_util::sync::CancellationToken;
 /// The learner may die this often without completing an iteration in between.
 const LIVES: u32 = 4;
 
-/// How a training run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TrainEnd {
     /// Target reached or budget spent; summary.json exists.
@@ -33,10 +30,8 @@ pub(crate) enum TrainEnd {
     Stopped,
 }
 
-/// Actor processes and their threads.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ActorPlan {
-    /// Number of processes.
     pub(crate) actors: usize,
     /// Rollout threads of each.
     pub(crate) threads: usize,
@@ -47,11 +42,9 @@ pub(crate) struct ActorPlan {
 pub(crate) struct ServicesPlan<'a> {
     /// Run folder with a checkpoint.
     pub(crate) folder: &'a Path,
-    /// Training threads of the learner.
     pub(crate) threads: usize,
     /// Address of the live page, if there is one.
     pub(crate) http: Option<&'a str>,
-    /// The actors.
     pub(crate) actors: ActorPlan,
 }
 
@@ -117,12 +110,12 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
                     Some(exit::TEMPORARY) => break Ok(TrainEnd::Stopped),
                     _ => lives -= 1,
                 }
-                if lives == 0 || code.is_some_and(|code| [exit::USAGE, exit::CANNOT_CREATE].contains(&code)) {
+                if lives == 0 || matches!(code, Some(exit::USAGE | exit::CANNOT_CREATE)) {
                     break Err(learner.gave_up(code, &reason));
                 }
                 tracing::warn!(reason, "the learner died; restarting it from its checkpoint");
-                let mut waits = [200].into_iter().chain(std::iter::repeat(1000));
-                let wait = || Duration::from_millis(waits.next().unwrap_or(1000));
+                let mut millis = 200;
+                let wait = || Duration::from_millis(std::mem::replace(&mut millis, 1000));
                 running = learner.restart(&mut lives, wait).await?;
             },
             Some(ended) = services.join_next() => {
@@ -163,7 +156,7 @@ fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
     let trained =
         serde_json::from_str::<serde_json::Value>(&report.metrics_json).is_ok_and(|v| !v["executor"].is_null());
     // The last line only evaluates: it has the number of the line before it.
-    let place = (report.iteration.0, !trained);
+    let place = (report.iteration, !trained);
     let new = place > *shown;
     *shown = place.max(*shown);
     new
@@ -193,20 +186,9 @@ async fn follow(url: &str, events: &mpsc::Sender<RunEvent>) -> anyhow::Result<()
     let opened = tokio::time::timeout(Duration::from_secs(10), client.watch_run(v1::WatchRunRequest {})).await;
     let mut stream = opened??.into_inner();
     while let Some(message) = stream.message().await? {
-        let event = match message.event {
-            Some(Event::Iteration(e)) => RunEvent::Iteration(IterationReport {
-                iteration: Iteration(e.iteration),
-                joint_env_steps: e.joint_env_steps,
-                success: e.success,
-                reward: e.reward,
-                metrics_json: e.metrics_json,
-            }),
-            Some(Event::Log(text)) => RunEvent::Log(text),
-            Some(Event::Checkpoint(e)) => RunEvent::Checkpoint { iteration: Iteration(e.iteration), path: e.path },
-            Some(Event::Finished(e)) => RunEvent::Finished { summary_json: e.summary_json },
-            None => continue,
-        };
-        events.send(event).await?;
+        if let Some(event) = message.event {
+            events.send(event).await?;
+        }
     }
     Ok(())
 }
@@ -216,13 +198,8 @@ mod tests {
     use super::*;
 
     fn event(iteration: u32, executor: &str) -> RunEvent {
-        RunEvent::Iteration(IterationReport {
-            iteration: Iteration(iteration),
-            joint_env_steps: 0,
-            success: None,
-            reward: None,
-            metrics_json: format!("{{\"executor\":{executor}}}"),
-        })
+        let metrics_json = format!("{{\"executor\":{executor}}}");
+        RunEvent::Iteration(v1::IterationEvent { iteration, metrics_json, ..Default::default() })
     }
 
     #[test]

@@ -15,10 +15,8 @@ use magex_core::task::{Spawn, TaskConfig};
 use magex_env::spawn::spawn;
 use magex_nets::commander::Team;
 
-/// Team sizes.
 pub(crate) const SIZES: [usize; 2] = [2, 200];
 
-/// One team in the plane.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Synthetic {
     /// `[N, 2]`
@@ -44,13 +42,11 @@ impl Synthetic {
         }
     }
 
-    /// A start of Simple Spread.
     pub(crate) fn starts(n: usize, layout: Spawn, stream: &mut Stream) -> Self {
         let start = spawn(&TaskConfig::simple_spread(n, layout), stream);
         Self { agents: start.agents, goals: start.landmarks }
     }
 
-    /// As the scheduler takes it.
     pub(crate) fn team(&self) -> Team<'_> {
         Team { agents: &self.agents, goals: &self.goals, dims: 2 }
     }

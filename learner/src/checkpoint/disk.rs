@@ -4,45 +4,39 @@ use std::fs::{self, File};
 use std::io;
 use std::path::Path;
 
-/// The steps. [`FileSystem`] takes them; tests put something in between.
+/// The steps, taken on the real file system; tests put something in between.
 pub trait Disk: std::fmt::Debug + Send {
     /// Makes a folder and those above it.
-    fn create_dir(&mut self, path: &Path) -> io::Result<()>;
+    fn create_dir(&mut self, path: &Path) -> io::Result<()> {
+        fs::create_dir_all(path)
+    }
+
     /// Makes or replaces a file. A kill may leave part of it.
-    fn write(&mut self, path: &Path, bytes: &[u8]) -> io::Result<()>;
+    fn write(&mut self, path: &Path, bytes: &[u8]) -> io::Result<()> {
+        fs::write(path, bytes)
+    }
+
     /// Returns once a file, or the entries of a folder, would survive a power cut.
-    fn sync(&mut self, path: &Path) -> io::Result<()>;
+    fn sync(&mut self, path: &Path) -> io::Result<()> {
+        File::open(path)?.sync_all()
+    }
+
     /// Gives a file or folder another name, at once.
-    fn rename(&mut self, from: &Path, to: &Path) -> io::Result<()>;
+    fn rename(&mut self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::rename(from, to)
+    }
+
     /// Removes a folder and what is in it. A kill may leave part of it.
-    fn remove_dir(&mut self, path: &Path) -> io::Result<()>;
+    fn remove_dir(&mut self, path: &Path) -> io::Result<()> {
+        fs::remove_dir_all(path)
+    }
 }
 
 /// The real one.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct FileSystem;
 
-impl Disk for FileSystem {
-    fn create_dir(&mut self, path: &Path) -> io::Result<()> {
-        fs::create_dir_all(path)
-    }
-
-    fn write(&mut self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        fs::write(path, bytes)
-    }
-
-    fn sync(&mut self, path: &Path) -> io::Result<()> {
-        File::open(path)?.sync_all()
-    }
-
-    fn rename(&mut self, from: &Path, to: &Path) -> io::Result<()> {
-        fs::rename(from, to)
-    }
-
-    fn remove_dir(&mut self, path: &Path) -> io::Result<()> {
-        fs::remove_dir_all(path)
-    }
-}
+impl Disk for FileSystem {}
 
 /// Replaces a file as a whole: a reader sees the old one or the new one, also after a kill or a power cut.
 pub fn replace_file(disk: &mut dyn Disk, folder: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {

@@ -33,10 +33,13 @@ impl Stage {
     }
 }
 
-/// Where the time of the shards of one plan went. Sums over concurrent shards, so they may exceed the wall time.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+/// Where the time of the shards of one plan went, seconds. Sums over concurrent shards, so they may exceed the wall time.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct CollectTiming {
-    /// Held by actors, seconds: waiting and computing.
+    /// Wall time without a lease outstanding; counts as the actors'.
+    pub idle_s: f64,
+    /// Held by actors: waiting and computing.
+    #[serde(skip)]
     pub held_s: f64,
     /// Of these rolling out.
     pub rollout_s: f64,
@@ -46,8 +49,6 @@ pub struct CollectTiming {
     pub weights_wait_s: f64,
     /// Between lease and result and not held by the actor: in transfer.
     pub transfer_s: f64,
-    /// Wall time without a lease outstanding, seconds.
-    pub idle_s: f64,
 }
 
 /// The bottleneck of an iteration, with the numbers behind it.
@@ -61,33 +62,26 @@ pub struct Bottleneck {
     pub learner_s: f64,
     /// Seconds attributed to the network.
     pub network_s: f64,
-    /// Of the actors' seconds: no lease was outstanding.
-    pub idle_s: f64,
-    /// Sum over shards: rolling out.
-    pub rollout_s: f64,
-    /// Sum over shards: waiting for the commander.
-    pub goals_wait_s: f64,
-    /// Sum over shards: waiting for the weights.
-    pub weights_wait_s: f64,
-    /// Sum over shards: leases and results in transfer.
-    pub transfer_s: f64,
+    /// Where the time of the shards went; zeros without a network.
+    #[serde(flatten)]
+    pub shards: CollectTiming,
 }
 
 /// Attributes an iteration of `learner_s` seconds of the learner's own and `collect_s` seconds of waiting for results.
 /// Without `timing` there is no network: everything ran in one process.
 pub fn attribute(learner_s: f64, collect_s: f64, timing: Option<&CollectTiming>) -> Bottleneck {
-    let all = timing.copied().unwrap_or_default();
-    let idle_s = all.idle_s.clamp(0.0, collect_s.max(0.0));
+    let mut shards = timing.copied().unwrap_or_default();
+    shards.idle_s = shards.idle_s.clamp(0.0, collect_s.max(0.0));
     // Waiting for weights counts as transfer: they are under way.
-    let (computing, transfer) = ((all.held_s - all.weights_wait_s).max(0.0), all.transfer_s + all.weights_wait_s);
+    let computing = (shards.held_s - shards.weights_wait_s).max(0.0);
+    let transfer = shards.transfer_s + shards.weights_wait_s;
     let share = if transfer > 0.0 { transfer / (computing + transfer) } else { 0.0 };
-    let network_s = (collect_s - idle_s).max(0.0) * share;
+    let network_s = (collect_s - shards.idle_s).max(0.0) * share;
     let actor_s = (collect_s - network_s).max(0.0);
     let parts = [(Stage::Actor, actor_s), (Stage::Learner, learner_s), (Stage::Network, network_s)];
     // Ties go to the first stage.
     let stage = parts.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(Stage::Actor, |part| part.0);
-    let CollectTiming { rollout_s, goals_wait_s, weights_wait_s, transfer_s, .. } = all;
-    Bottleneck { stage, actor_s, learner_s, network_s, idle_s, rollout_s, goals_wait_s, weights_wait_s, transfer_s }
+    Bottleneck { stage, actor_s, learner_s, network_s, shards }
 }
 
 #[cfg(test)]

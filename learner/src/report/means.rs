@@ -61,16 +61,10 @@ impl IterationMeans {
 /// The greedy columns, then the sampled ones.
 impl Serialize for IterationMeans {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(None)?;
-        for (row, metric) in METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy()) {
-            map.serialize_entry(metric.name, &self.get(row))?;
-        }
-        for (row, metric) in METRICS.iter().enumerate() {
-            if let Some(column) = metric.sampled {
-                map.serialize_entry(column, &self.sampled.and_then(|summary| summary.means[row]))?;
-            }
-        }
-        map.end()
+        let greedy = METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy());
+        let sampled = |row: usize| self.sampled.and_then(|summary| summary.means[row]);
+        let sampled = METRICS.iter().enumerate().filter_map(|(row, metric)| Some((metric.sampled?, sampled(row))));
+        serializer.collect_map(greedy.map(|(row, metric)| (metric.name, self.get(row))).chain(sampled))
     }
 }
 

@@ -1,14 +1,27 @@
 //! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
 
-use crate::report::metrics_file::{FileError, IterationMetrics, MetricsFile};
-use crate::run_events::{IterationReport, RunEvent};
+use crate::report::records::IterationMetrics;
+use crate::run_events::RunEvent;
 use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
+use magex_proto::v1::IterationEvent;
 use magex_proto::weights::Weights;
-use magex_viewer::page::{Phase, RunEnd};
+use magex_viewer::page::{LivePage, Phase, RunEnd};
 use std::fmt::Debug;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::Sender;
 use std::time::Duration;
+
+/// A file of the run folder that cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+#[error("{path}: {error}")]
+pub struct FileError {
+    /// The file.
+    pub path: PathBuf,
+    /// The system's error.
+    pub error: std::io::Error,
+}
 
 /// The run as an observer finds it.
 #[derive(Debug, Clone, Copy)]
@@ -18,7 +31,7 @@ pub struct RunStart<'a> {
     /// Folder of the run.
     pub folder: &'a Path,
     /// The last iteration of an earlier process, if the run is resumed.
-    pub before: Option<&'a IterationReport>,
+    pub before: Option<&'a IterationEvent>,
 }
 
 /// Follows a run. The training thread calls every observer of the trainer's list, in the order of the list, and waits: an
@@ -41,13 +54,13 @@ pub trait RunObserver: Debug + Send {
     /// An evaluation was collected.
     fn evaluated(&mut self, _outcomes: &[EvalOutcome]) {}
 
-    /// An iteration is complete. `report` has its line of metrics.jsonl.
-    fn iteration(&mut self, _metrics: &IterationMetrics, _report: &IterationReport) {}
+    /// An iteration is complete. `report` has its line of metrics.jsonl; [`Self::event`] receives it next.
+    fn iteration(&mut self, _metrics: &IterationMetrics, _report: &IterationEvent) {}
 
     /// An attempt to write a checkpoint ended. `written` is its folder; `None` if it could not be written.
     fn checkpoint(&mut self, _took: Duration, _written: Option<&Path>) {}
 
-    /// Something else happened: a message, a checkpoint, or the end of the run.
+    /// Something happened: an iteration, a message, a checkpoint, or the end of the run.
     fn event(&mut self, _event: &RunEvent) {}
 
     /// Makes what was written so far durable, before a checkpoint that contains it. Errors show again in [`Self::flush`].
@@ -65,16 +78,39 @@ pub trait RunObserver: Debug + Send {
     fn end(&mut self, _end: &RunEnd) {}
 }
 
-impl RunObserver for MetricsFile {
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
-        self.append(report);
+/// Sends the events of a run to another thread. Events after the receiver is gone are dropped.
+impl RunObserver for Sender<RunEvent> {
+    fn event(&mut self, event: &RunEvent) {
+        let _ = self.send(event.clone());
+    }
+}
+
+impl RunObserver for Arc<LivePage> {
+    fn begin(&mut self, start: RunStart<'_>) {
+        LivePage::begin(self, start.run_id, start.folder);
     }
 
-    fn sync(&mut self) {
-        MetricsFile::sync(self);
+    fn wants_recording(&self) -> bool {
+        true
     }
 
-    fn flush(&mut self) -> Result<(), FileError> {
-        MetricsFile::flush(self)
+    fn phase(&mut self, phase: Phase) {
+        LivePage::phase(self, phase);
+    }
+
+    fn published(&mut self, weights: &Weights) {
+        LivePage::published(self, weights);
+    }
+
+    fn evaluated(&mut self, outcomes: &[EvalOutcome]) {
+        LivePage::evaluated(self, outcomes);
+    }
+
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
+        self.line(&report.metrics_json);
+    }
+
+    fn end(&mut self, end: &RunEnd) {
+        self.ended(end.clone());
     }
 }

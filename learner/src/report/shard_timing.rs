@@ -10,17 +10,14 @@ pub(crate) struct ShardTiming {
     sums: CollectTiming,
     /// Since when no lease is outstanding.
     idle_since: Option<Instant>,
-    /// When the results of training shards arrived.
     arrivals: Vec<Instant>,
 }
 
 impl ShardTiming {
-    /// Starts a new plan.
     pub(crate) fn start(&mut self) {
         *self = Self::default();
     }
 
-    /// Sets the number of outstanding leases.
     pub(crate) fn leases_outstanding(&mut self, leases: u64, now: Instant) {
         match (leases, self.idle_since) {
             (0, None) => self.idle_since = Some(now),

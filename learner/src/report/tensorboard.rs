@@ -6,9 +6,9 @@
 //!
 //! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
 
-use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::RunObserver;
-use crate::run_events::IterationReport;
+use crate::report::records::IterationMetrics;
+use magex_proto::v1::IterationEvent;
 use prost::Message;
 use serde_json::Value;
 use std::fs::{File, OpenOptions};
@@ -16,10 +16,8 @@ use std::io::{Error, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Folder of the event files in a run folder.
-pub const FOLDER: &str = "tensorboard";
+const FOLDER: &str = "tensorboard";
 
-/// What the names of the files begin with.
 const PREFIX: &str = "events.out.tfevents.";
 
 /// The part of tensorflow.Event that is written.
@@ -29,18 +27,13 @@ struct Event {
     wall_time: f64,
     #[prost(int64, tag = "2")]
     step: i64,
-    #[prost(oneof = "What", tags = "3, 5, 7")]
-    what: Option<What>,
-}
-
-#[derive(Clone, PartialEq, prost::Oneof)]
-enum What {
-    #[prost(string, tag = "3")]
-    FileVersion(String),
-    #[prost(message, tag = "5")]
-    Summary(Summary),
-    #[prost(message, tag = "7")]
-    SessionLog(SessionLog),
+    /// One of this and the next two is set.
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -67,12 +60,7 @@ struct SessionLog {
 
 /// Writes event files. An error is logged once and ends the writing; training continues.
 #[derive(Debug)]
-pub struct EventFile {
-    state: State,
-}
-
-#[derive(Debug)]
-enum State {
+pub(crate) enum EventFile {
     /// Nothing is written after an error.
     Off,
     /// No file yet: the folder, and the steps that a resumed run continues from.
@@ -82,36 +70,36 @@ enum State {
 
 impl EventFile {
     /// In a run folder; `resumed` is the number of steps that the run continues from. The file appears with the first line.
-    pub fn new(folder: &Path, resumed: Option<u64>) -> Self {
-        Self { state: State::Waiting(folder.join(FOLDER), resumed) }
+    pub(crate) fn new(folder: &Path, resumed: Option<u64>) -> Self {
+        Self::Waiting(folder.join(FOLDER), resumed)
     }
 
     /// Writes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
-    pub fn append(&mut self, line: &str, step: u64) {
+    fn append(&mut self, line: &str, step: u64) {
         if let Err((path, error)) = self.write(line, step) {
             tracing::warn!(path = %path.display(), %error, "no more TensorBoard events will be written");
-            self.state = State::Off;
+            *self = Self::Off;
         }
     }
 
     fn write(&mut self, line: &str, step: u64) -> Result<(), (PathBuf, Error)> {
-        if let State::Waiting(folder, resumed) = &self.state {
+        if let Self::Waiting(folder, resumed) = self {
             let (file, path) = open(folder, *resumed).map_err(|error| (folder.clone(), error))?;
-            self.state = State::Open(file, path);
+            *self = Self::Open(file, path);
         }
-        let State::Open(file, path) = &mut self.state else { return Ok(()) };
+        let Self::Open(file, path) = self else { return Ok(()) };
         let mut values = Vec::new();
         if let Ok(line) = serde_json::from_str(line) {
             scalars("", &line, &mut values);
         }
-        let record = record(step, What::Summary(Summary { values }));
+        let record = record(step, Event { summary: Some(Summary { values }), ..Event::default() });
         // One write, so that a concurrent reader finds whole records.
         file.write_all(&record).map_err(|error| (path.clone(), error))
     }
 }
 
 impl RunObserver for EventFile {
-    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationReport) {
+    fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         self.append(&report.metrics_json, report.joint_env_steps);
     }
 }
@@ -130,9 +118,9 @@ fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
             other => break (other?, path),
         }
     };
-    let mut head = record(0, What::FileVersion("brain.Event:2".to_owned()));
+    let mut head = record(0, Event { file_version: Some("brain.Event:2".to_owned()), ..Event::default() });
     if let Some(steps) = resumed {
-        head.extend(record(steps + 1, What::SessionLog(SessionLog { status: 1 })));
+        head.extend(record(steps + 1, Event { session_log: Some(SessionLog { status: 1 }), ..Event::default() }));
     }
     file.write_all(&head)?;
     Ok((file, path))
@@ -145,8 +133,8 @@ fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
         match value {
             Value::Number(number) => {
                 let group = if group.is_empty() { "run" } else { group };
-                let value = number.as_f64().map(|x| x as f32);
-                out.push(Scalar { tag: format!("{group}/{name}"), simple_value: value });
+                let simple_value = number.as_f64().map(|x| x as f32);
+                out.push(Scalar { tag: format!("{group}/{name}"), simple_value });
             }
             Value::Object(_) if group.is_empty() => scalars(name, value, out),
             Value::Object(_) => scalars(&format!("{group}/{name}"), value, out),
@@ -155,10 +143,10 @@ fn scalars(group: &str, value: &Value, out: &mut Vec<Scalar>) {
     }
 }
 
-fn record(step: u64, what: What) -> Vec<u8> {
+fn record(step: u64, event: Event) -> Vec<u8> {
     #[allow(clippy::disallowed_methods, reason = "what a person reads in TensorBoard; no number of a run")]
     let wall_time = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
-    let event = Event { wall_time, step: step as i64, what: Some(what) }.encode_to_vec();
+    let event = Event { wall_time, step: step as i64, ..event }.encode_to_vec();
     let length = (event.len() as u64).to_le_bytes();
     [&length[..], &masked(&length), &event, &masked(&event)].concat()
 }

@@ -5,7 +5,6 @@ use crate::serve::lock_order::{OrderedMutex, Rank};
 use std::sync::atomic::{AtomicBool, Ordering};
 use tokio_util::sync::CancellationToken;
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Control {
     stop: OrderedMutex<Option<StopReason>>,

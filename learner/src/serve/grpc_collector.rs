@@ -13,21 +13,18 @@ use std::sync::Arc;
 /// The collector whose actors connect over gRPC. Made by [`crate::serve::service::learner_service`].
 #[derive(Debug)]
 pub struct GrpcCollector {
-    shared: Arc<Shared>,
-    timing: CollectTiming,
+    pub(crate) shared: Arc<Shared>,
+    /// Of the last plan that was collected.
+    pub(crate) timing: CollectTiming,
 }
 
 impl GrpcCollector {
-    pub(crate) fn new(shared: Arc<Shared>) -> Self {
-        Self { shared, timing: CollectTiming::default() }
-    }
-
     /// Opens a plan and returns at once; sessions with credit lease its shards from now on.
     pub fn open(&mut self, plan: Vec<Shard>) -> Result<(), CollectError> {
         if let Some(shard) = plan.iter().find(|shard| !self.shared.board.is_kept(shard.version)) {
             return Err(CollectError::Version(shard.version));
         }
-        Ok(self.shared.work.open(plan)?)
+        self.shared.work.open(plan)
     }
 
     /// Blocks until the open plan is complete.
@@ -46,7 +43,7 @@ impl Collector for GrpcCollector {
     fn publish(&mut self, weights: &Arc<Weights>) -> Result<(), CollectError> {
         let own = &self.shared.run.run_id;
         if weights.run_id != *own {
-            return Err(CollectError::OtherRun { weights: weights.run_id.clone(), own: own.clone() });
+            return Err(CollectError::OtherRun(weights.run_id.clone(), own.clone()));
         }
         self.shared.publish(weights.clone());
         Ok(())

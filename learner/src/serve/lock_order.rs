@@ -19,7 +19,6 @@ thread_local! {
     static HELD: Cell<u8> = const { Cell::new(0) };
 }
 
-/// A mutex with a [`Rank`].
 #[derive(Debug)]
 pub(crate) struct OrderedMutex<T> {
     rank: Rank,
@@ -42,7 +41,6 @@ impl<T> OrderedMutex<T> {
     }
 }
 
-/// Access to the value of an [`OrderedMutex`], until dropped.
 #[derive(Debug)]
 pub(crate) struct OrderedGuard<'a, T> {
     guard: MutexGuard<'a, T>,
@@ -50,7 +48,6 @@ pub(crate) struct OrderedGuard<'a, T> {
 }
 
 impl<T> OrderedGuard<'_, T> {
-    /// [`Condvar::wait`].
     pub(crate) fn wait(self, condvar: &Condvar) -> Self {
         let Self { guard, _held } = self;
         Self { guard: condvar.wait(guard).unwrap_or_else(PoisonError::into_inner), _held }

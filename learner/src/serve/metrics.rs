@@ -1,8 +1,8 @@
 //! The learner's Prometheus metrics, each declared once; docs/metrics.md describes them.
 
 use crate::report::bottleneck::{Bottleneck, Stage};
-use crate::report::metrics_file::IterationMetrics;
-use crate::serve::ledger;
+use crate::report::records::IterationMetrics;
+use crate::serve::ledger::Counters;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
@@ -11,7 +11,6 @@ use magex_runtime::metrics::{
 };
 use std::time::Duration;
 
-/// The metrics of the learner.
 #[derive(Debug)]
 pub(crate) struct LearnerMetrics {
     shards: LeaseMetrics,
@@ -48,7 +47,6 @@ pub(crate) const ENDS: [&str; 5] = ["left", "silent", "replaced", "closing", "re
 const PHASES: [&str; 5] = ["publish", "collect", "executor", "commander", "checkpoint"];
 
 impl LearnerMetrics {
-    /// Declares all of them.
     pub(crate) fn new(m: &Metrics) -> Self {
         let metrics = Self {
             shards: LeaseMetrics::new(m, "shards", "Shards"),
@@ -123,7 +121,7 @@ impl LearnerMetrics {
     }
 
     /// Sets the metrics of the ledger. Called under its lock.
-    pub(crate) fn ledger(&self, shards: &ledger::Counters, episodes: &ledger::Counters, queued: usize) {
+    pub(crate) fn ledger(&self, shards: &Counters, episodes: &Counters, queued: usize) {
         self.shards.set(shards);
         self.episodes.set(episodes);
         self.queue("shards", queued);
@@ -141,19 +139,16 @@ impl LearnerMetrics {
         GaugeGuard::new(self.subscribers.with_label_values(&[role_name(role)]))
     }
 
-    /// Counts the joint steps and agent steps of an accepted result.
     pub(crate) fn accepted(&self, (joint, agent): (u64, u64)) {
         self.joint_steps.inc_by(joint);
         self.agent_steps.inc_by(agent);
     }
 
-    /// The batch is complete.
     pub(crate) fn batch(&self, lags: &[f64], ages: &[f64]) {
         set_stats(&self.policy_lag, lags);
         set_stats(&self.sample_age, ages);
     }
 
-    /// An iteration is complete.
     pub(crate) fn iteration(&self, metrics: &IterationMetrics) {
         let timing = &metrics.timing;
         self.iterations.inc_by(u64::from(metrics.executor.is_some()));
@@ -162,18 +157,17 @@ impl LearnerMetrics {
             self.phase.with_label_values(&[phase]).observe(seconds.max(0.0));
         }
         let Bottleneck { stage, actor_s, learner_s, network_s, .. } = timing.bottleneck;
-        self.bottleneck.with_label_values(&[stage.name()]).inc_by(1);
+        self.bottleneck.with_label_values(&[stage.name()]).inc();
         for (stage, seconds) in Stage::ALL.iter().zip([actor_s, learner_s, network_s]) {
             self.bottleneck_seconds.with_label_values(&[stage.name()]).set(seconds);
         }
         if let Some(skipped) = metrics.executor.as_ref().and_then(|update| update.get("skipped_minibatches")) {
             self.skipped.inc_by(skipped as u64);
         }
-        if let Some(success) = metrics.episodes.get(SUCCESS_RATE) {
-            self.success.set(success);
-        }
-        if let Some(reward) = metrics.episodes.get(REWARD) {
-            self.reward.set(reward);
+        for (gauge, metric) in [(&self.success, SUCCESS_RATE), (&self.reward, REWARD)] {
+            if let Some(value) = metrics.episodes.get(metric) {
+                gauge.set(value);
+            }
         }
     }
 
@@ -213,11 +207,11 @@ impl LeaseMetrics {
         }
     }
 
-    fn set(&self, c: &ledger::Counters) {
+    fn set(&self, c: &Counters) {
         let totals = [c.leased, c.trained, c.duplicate, c.expired, c.rejected, c.failed];
         self.counters.iter().zip(totals).for_each(|(counter, total)| raise_to(counter, total));
         self.outstanding.set(c.outstanding as f64);
-        self.residual.set(c.residual() as f64);
+        self.residual.set(c.residual as f64);
     }
 }
 

@@ -1,10 +1,11 @@
 //! The service as an observer of the run: Prometheus, the status, the event streams and the log.
 
-use crate::report::metrics_file::IterationMetrics;
 use crate::report::observer::{RunObserver, RunStart};
-use crate::run_events::{IterationReport, RunEvent};
+use crate::report::records::IterationMetrics;
+use crate::run_events::RunEvent;
 use crate::serve::shared::Shared;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
+use magex_proto::v1::IterationEvent;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,13 +13,7 @@ use std::time::Duration;
 /// Made by [`crate::serve::service::LearnerHandle::observer`].
 #[derive(Debug)]
 pub struct ServiceObserver {
-    shared: Arc<Shared>,
-}
-
-impl ServiceObserver {
-    pub(crate) fn new(shared: Arc<Shared>) -> Self {
-        Self { shared }
-    }
+    pub(crate) shared: Arc<Shared>,
 }
 
 impl RunObserver for ServiceObserver {
@@ -29,9 +24,9 @@ impl RunObserver for ServiceObserver {
         }
     }
 
-    fn iteration(&mut self, metrics: &IterationMetrics, report: &IterationReport) {
+    fn iteration(&mut self, metrics: &IterationMetrics, _report: &IterationEvent) {
         self.shared.metrics.iteration(metrics);
-        let (bottleneck, timing) = (&metrics.timing.bottleneck, &metrics.timing);
+        let bottleneck = &metrics.timing.bottleneck;
         tracing::info!(
             iteration = metrics.iteration,
             joint_env_steps = metrics.joint_env_steps,
@@ -41,10 +36,9 @@ impl RunObserver for ServiceObserver {
             actor_s = bottleneck.actor_s,
             learner_s = bottleneck.learner_s,
             network_s = bottleneck.network_s,
-            collect_s = timing.collect_s,
+            collect_s = metrics.timing.collect_s,
             "iteration"
         );
-        self.event(&RunEvent::Iteration(report.clone()));
     }
 
     fn checkpoint(&mut self, took: Duration, written: Option<&Path>) {
@@ -54,17 +48,16 @@ impl RunObserver for ServiceObserver {
     fn event(&mut self, event: &RunEvent) {
         match event {
             RunEvent::Iteration(report) => self.shared.status.iteration(report),
-            RunEvent::Finished { .. } => self.shared.status.finish(),
-            RunEvent::Log(_) | RunEvent::Checkpoint { .. } => {}
+            RunEvent::Finished(_) => self.shared.status.finish(),
+            RunEvent::Log(_) | RunEvent::Checkpoint(_) => {}
         }
         self.shared.events.push(event.clone());
-        if matches!(event, RunEvent::Finished { .. }) {
+        if matches!(event, RunEvent::Finished(_)) {
             self.shared.control.complete.cancel();
         }
     }
 }
 
-/// Bytes of the files in a folder.
 fn size_of(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
     entries.filter_map(|entry| entry.metadata().ok()).map(|meta| meta.len()).sum()

@@ -2,7 +2,7 @@
 
 use crate::serve::ledger::SessionId;
 use crate::serve::lock_order::{OrderedMutex, Rank};
-use magex_core::ids::WeightsVersion;
+use crate::serve::metrics::LearnerMetrics;
 use magex_proto::v1;
 use magex_runtime::status;
 use std::collections::{BTreeMap, VecDeque};
@@ -14,25 +14,18 @@ use tonic::Status;
 
 /// A missing actor counts as expected for this time.
 const MISSING_TIME: Duration = Duration::from_secs(600);
-/// Limit of missing actors that are remembered.
 const MAX_MISSING: usize = 1024;
-/// Limit of evicted processes that are remembered.
 const MAX_EVICTED: usize = 1024;
 
 /// One session, as the rest of the service sees it.
 #[derive(Debug, Clone)]
 pub(crate) struct ActorEntry {
-    pub(crate) actor_id: String,
+    /// Without its leases, which the ledger knows, and without the age of its last message.
+    pub(crate) status: v1::ActorStatus,
     pub(crate) process_id: u64,
-    pub(crate) address: String,
-    pub(crate) threads: u32,
-    pub(crate) shards_done: u64,
-    /// Version of the latest result.
-    pub(crate) weights_version: Option<WeightsVersion>,
     pub(crate) last_seen: Instant,
     /// Ends the session: the same process has connected again.
     pub(crate) replaced: CancellationToken,
-    /// Queue of outgoing messages.
     pub(crate) outbound: WeakSender<Result<v1::RolloutResponse, Status>>,
 }
 
@@ -40,16 +33,6 @@ impl ActorEntry {
     fn queued_messages(&self) -> usize {
         self.outbound.upgrade().map_or(0, |queue| queue.max_capacity() - queue.capacity())
     }
-}
-
-/// Totals for the metrics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct RosterCounts {
-    pub(crate) connected: usize,
-    pub(crate) missing: usize,
-    pub(crate) threads: usize,
-    /// Messages that wait to be sent.
-    pub(crate) queued_messages: usize,
 }
 
 #[derive(Debug, Default)]
@@ -75,7 +58,6 @@ impl Members {
     }
 }
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Roster {
     members: OrderedMutex<Members>,
@@ -110,7 +92,7 @@ impl Roster {
             return Err(status::resource_exhausted(problem, Duration::from_secs(5)));
         }
         let id = SessionId(self.next_session.fetch_add(1, Ordering::Relaxed));
-        members.missing.remove(&actor.actor_id);
+        members.missing.remove(&actor.status.actor_id);
         members.connected.insert(id, actor);
         Ok(id)
     }
@@ -122,24 +104,16 @@ impl Roster {
     /// Records that an actor is missing, unless it has another session.
     pub(crate) fn mark_missing(&self, name: &str) {
         let mut members = self.members.lock();
-        let connected = members.connected.values().any(|actor| actor.actor_id == name);
+        let connected = members.connected.values().any(|actor| actor.status.actor_id == name);
         if !connected && members.missing.len() < MAX_MISSING {
             members.missing.insert(name.to_owned(), Instant::now());
         }
     }
 
-    /// Records when a message of this session arrived.
-    pub(crate) fn mark_seen(&self, session: SessionId, at: Instant) {
+    /// Changes the entry of a session, unless it has ended.
+    pub(crate) fn update(&self, session: SessionId, change: impl FnOnce(&mut ActorEntry)) {
         if let Some(actor) = self.members.lock().connected.get_mut(&session) {
-            actor.last_seen = at;
-        }
-    }
-
-    /// Records a result of this session that the batch accepted.
-    pub(crate) fn mark_shard_done(&self, session: SessionId, version: WeightsVersion) {
-        if let Some(actor) = self.members.lock().connected.get_mut(&session) {
-            actor.shards_done += 1;
-            actor.weights_version = Some(version);
+            change(actor);
         }
     }
 
@@ -148,7 +122,6 @@ impl Roster {
         self.members.lock().processes().collect()
     }
 
-    /// Bars a process from further sessions.
     pub(crate) fn evict(&self, process_id: u64) {
         self.members.lock().evict(process_id);
     }
@@ -172,16 +145,14 @@ impl Roster {
         self.members.lock().connected.iter().map(|(id, actor)| (*id, actor.clone())).collect()
     }
 
-    /// Forgets actors that have been missing for too long, and counts.
-    pub(crate) fn counts(&self) -> RosterCounts {
+    /// Forgets actors that have been missing for too long, and sets the gauges of the others.
+    pub(crate) fn refresh(&self, metrics: &LearnerMetrics) {
         let mut members = self.members.lock();
         members.missing.retain(|_, since| since.elapsed() < MISSING_TIME);
-        let sum = |f: fn(&ActorEntry) -> usize| members.connected.values().map(f).sum();
-        RosterCounts {
-            connected: members.connected.len(),
-            missing: members.missing.len(),
-            threads: sum(|actor| actor.threads as usize),
-            queued_messages: sum(ActorEntry::queued_messages),
-        }
+        let connected = members.connected.len();
+        metrics.actors_live.set(connected as f64);
+        metrics.actors_expected.set((connected + members.missing.len()) as f64);
+        metrics.actor_threads.set(members.connected.values().map(|actor| f64::from(actor.status.threads)).sum());
+        metrics.queue("actors", members.connected.values().map(ActorEntry::queued_messages).sum());
     }
 }

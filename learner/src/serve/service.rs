@@ -1,5 +1,6 @@
 //! The learner's gRPC service, and its server.
 
+use crate::report::bottleneck::CollectTiming;
 use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
@@ -24,12 +25,11 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Request, Response, Result, Streaming};
 
 /// Default time of a lease.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
 
-/// Streaming methods.
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
 /// Limits in flight, per caller and in total. All actors of a run may be one caller.
@@ -44,8 +44,8 @@ pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, Grpc
             shared.refresh_gauges();
         }
     });
-    let security = Security::default();
-    (LearnerHandle { shared: shared.clone(), security }, GrpcCollector::new(shared))
+    let collector = GrpcCollector { shared: shared.clone(), timing: CollectTiming::default() };
+    (LearnerHandle { shared, security: Security::default() }, collector)
 }
 
 /// The network's end of the service.
@@ -79,9 +79,8 @@ impl LearnerHandle {
     /// Serves until `shutdown`. Then the trainer stops, actors receive the reason, streams end, and the call returns within
     /// [`server::GRACE`]. Cancel `shutdown` after the end of the run too: actors then receive that the run is complete.
     pub async fn serve(&self, incoming: Incoming, shutdown: CancellationToken) -> Result<(), ServeError> {
-        let (health, health_service) = Health::new::<LearnerServiceServer<LearnerApi>>().await;
-        let api = LearnerApi { shared: self.shared.clone() };
-        let service = LearnerServiceServer::new(api).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        let (health, health_service) = Health::new::<LearnerServiceServer<Self>>().await;
+        let service = LearnerServiceServer::new(self.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
         let connections = incoming.connections();
         let rules = Rules {
             access: self.security.access.clone(),
@@ -125,7 +124,7 @@ impl LearnerHandle {
 
     /// The observer through which the training thread reports to the service.
     pub fn observer(&self) -> ServiceObserver {
-        ServiceObserver::new(self.shared.clone())
+        ServiceObserver { shared: self.shared.clone() }
     }
 
     /// Returns after the first request to stop: a drain or a shutdown.
@@ -137,16 +136,8 @@ impl LearnerHandle {
     pub fn close(&self) {
         self.shared.close();
     }
-}
 
-/// The methods of the service, on top of the shared state.
-#[derive(Debug)]
-struct LearnerApi {
-    shared: Arc<Shared>,
-}
-
-impl LearnerApi {
-    fn check_open(&self) -> Result<(), Status> {
+    fn check_open(&self) -> Result<()> {
         if self.shared.control.closing.is_cancelled() {
             return Err(status::unavailable("the learner is shutting down", Duration::from_secs(1)));
         }
@@ -155,28 +146,25 @@ impl LearnerApi {
 }
 
 #[tonic::async_trait]
-impl LearnerService for LearnerApi {
-    type RolloutStream = ReceiverStream<Result<v1::RolloutResponse, Status>>;
+impl LearnerService for LearnerHandle {
+    type RolloutStream = ReceiverStream<Result<v1::RolloutResponse>>;
 
     // Answers before the first message arrives, because the actor's call returns only then.
-    async fn rollout(
-        &self,
-        request: Request<Streaming<v1::RolloutRequest>>,
-    ) -> Result<Response<Self::RolloutStream>, Status> {
+    async fn rollout(&self, request: Request<Streaming<v1::RolloutRequest>>) -> Result<Response<Self::RolloutStream>> {
         caller(&request, &[Role::Actor])?;
         self.check_open()?;
         let address = request.remote_addr().map_or_else(String::new, |address| address.to_string());
         let (outbound, stream) = mpsc::channel(64);
-        tokio::spawn(session::run(self.shared.clone(), address, request.into_inner(), outbound));
+        tokio::spawn(session::serve(self.shared.clone(), address, request.into_inner(), outbound));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    type WatchWeightsStream = ReceiverStream<Result<v1::WatchWeightsResponse, Status>>;
+    type WatchWeightsStream = ReceiverStream<Result<v1::WatchWeightsResponse>>;
 
     async fn watch_weights(
         &self,
         request: Request<v1::WatchWeightsRequest>,
-    ) -> Result<Response<Self::WatchWeightsStream>, Status> {
+    ) -> Result<Response<Self::WatchWeightsStream>> {
         caller(&request, &[Role::Actor, Role::Commander])?;
         self.check_open()?;
         let request = request.into_inner();
@@ -206,14 +194,14 @@ impl LearnerService for LearnerApi {
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>, Status> {
+    async fn get_run(&self, request: Request<v1::GetRunRequest>) -> Result<Response<v1::GetRunResponse>> {
         caller(&request, &[Role::Client])?;
         Ok(Response::new(v1::GetRunResponse { run: Some(self.shared.run_status()) }))
     }
 
-    type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse, Status>>;
+    type WatchRunStream = ReceiverStream<Result<v1::WatchRunResponse>>;
 
-    async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>, Status> {
+    async fn watch_run(&self, request: Request<v1::WatchRunRequest>) -> Result<Response<Self::WatchRunStream>> {
         caller(&request, &[Role::Client])?;
         let permit = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(64);
@@ -226,28 +214,25 @@ impl LearnerService for LearnerApi {
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
-    async fn checkpoint(
-        &self,
-        request: Request<v1::CheckpointRequest>,
-    ) -> Result<Response<v1::CheckpointResponse>, Status> {
+    async fn checkpoint(&self, request: Request<v1::CheckpointRequest>) -> Result<Response<v1::CheckpointResponse>> {
         caller(&request, &[])?;
         self.check_open()?;
-        match self.shared.run_status().state() {
-            v1::RunState::Finished => {
-                return Err(status::failed_precondition("the run is complete and already on disk"));
-            }
+        let refusal = match self.shared.run_status().state() {
+            v1::RunState::Finished => "the run is complete and already on disk",
             v1::RunState::WaitingForActors => {
-                return Err(status::failed_precondition(
-                    "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain \
-                     the learner, which writes one at once",
-                ));
+                "no actor is connected, so the iteration cannot end and no checkpoint is written; start actors, or drain the \
+                 learner, which writes one at once"
             }
-            _ => self.shared.control.request_checkpoint(),
-        }
-        Ok(Response::new(v1::CheckpointResponse { iteration: self.shared.status.current_iteration() }))
+            _ => {
+                self.shared.control.request_checkpoint();
+                let iteration = self.shared.status.current_iteration();
+                return Ok(Response::new(v1::CheckpointResponse { iteration }));
+            }
+        };
+        Err(status::failed_precondition(refusal))
     }
 
-    async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+    async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>> {
         caller(&request, &[])?;
         let reason = request.into_inner().reason;
         tracing::info!(reason, "drain requested");

@@ -1,10 +1,10 @@
 //! One connection of one actor: grants leases as its credit allows, receives results, and ends when the actor is silent for
 //! the time of a lease. The actor's end is `session` of `magex-actor`.
 
-mod handshake;
 mod results;
 
 use crate::serve::ledger::{LeaseId, SessionId};
+use crate::serve::roster::ActorEntry;
 use crate::serve::shared::Shared;
 use magex_proto::parts::Assembler;
 use magex_proto::v1::rollout_request::Message as Request;
@@ -20,13 +20,11 @@ use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
 use tracing::Span;
 
-/// Messages to an actor.
 pub(crate) type Outbound = mpsc::Sender<Result<v1::RolloutResponse, Status>>;
 
 /// Limit of the leases that an actor may hold, and of its credit for more.
 const MAX_LEASES: usize = 1024;
 
-/// Why a session ends.
 #[derive(Debug)]
 enum SessionEnd {
     /// The actor or the network closed the connection.
@@ -53,19 +51,77 @@ impl SessionEnd {
     }
 }
 
-/// Serves one connection from its first message to its end.
-pub(crate) async fn run(
+/// Serves one connection: waits for the hello, registers the actor and runs its session.
+pub(crate) async fn serve(
     shared: Arc<Shared>,
     address: String,
-    inbound: Streaming<v1::RolloutRequest>,
+    mut inbound: Streaming<v1::RolloutRequest>,
     outbound: Outbound,
 ) {
-    if let Some((session, inbound)) = handshake::accept(shared, address, inbound, outbound).await {
-        session.serve(inbound).await;
-    }
+    let first = tokio::select! {
+        () = shared.control.closing.cancelled() => return,
+        first = tokio::time::timeout(shared.lease_time(), inbound.message()) => first,
+    };
+    let answer = match first {
+        Ok(Ok(Some(_))) if shared.status.finished() => Ok(run_is_complete()),
+        Ok(Ok(Some(first))) => match handshake(&shared, address, first, &outbound) {
+            Ok((registered, hello)) => return Session::new(shared, registered, hello, outbound).serve(inbound).await,
+            Err(refusal) => {
+                tracing::warn!(reason = refusal.message(), "rejected an actor");
+                Err(refusal)
+            }
+        },
+        Ok(Ok(None) | Err(_)) => return,
+        Err(_) => Err(Status::deadline_exceeded("hello: did not arrive in time")),
+    };
+    let _ = outbound.send(answer).await;
 }
 
-/// A lease that this session granted.
+fn run_is_complete() -> v1::RolloutResponse {
+    let drain = v1::Drain { reason: "the run is complete".to_owned(), finished: true };
+    v1::RolloutResponse { message: Some(Response::Drain(drain)) }
+}
+
+/// Checks the hello and registers the session: its id, and the signal that another session of the process replaces it.
+fn handshake(
+    shared: &Shared,
+    address: String,
+    first: v1::RolloutRequest,
+    outbound: &Outbound,
+) -> Result<((SessionId, CancellationToken), v1::Hello), Status> {
+    let Some(Request::Hello(hello)) = first.message else {
+        return Err(status::invalid_argument("hello", "must be the first message"));
+    };
+    if hello.protocol_version != PROTOCOL_VERSION {
+        return Err(status::failed_precondition(format!(
+            "protocol_version: actor speaks protocol {}, learner speaks protocol {PROTOCOL_VERSION}; use the same release on both sides",
+            hello.protocol_version
+        )));
+    }
+    let own = &shared.run.task_fingerprint;
+    if !hello.task_fingerprint.is_empty() && hello.task_fingerprint != *own {
+        return Err(status::failed_precondition(format!(
+            "task_fingerprint: actor requires task {}, learner runs task {own}; start the actor with the run's \
+             configuration, or without one to accept the learner's",
+            hello.task_fingerprint
+        )));
+    }
+    let replaced = CancellationToken::new();
+    let id = shared.roster.join(ActorEntry {
+        status: v1::ActorStatus {
+            actor_id: hello.actor_id.clone(),
+            address,
+            threads: hello.threads,
+            ..Default::default()
+        },
+        process_id: hello.process_id,
+        last_seen: Instant::now(),
+        replaced: replaced.clone(),
+        outbound: outbound.downgrade(),
+    })?;
+    Ok(((id, replaced), hello))
+}
+
 struct GrantedLease {
     since: Instant,
     /// From the grant to the verdict on its result.
@@ -85,11 +141,9 @@ struct Session {
     assembling: Option<LeaseId>,
     /// Leases without a result.
     granted: HashMap<LeaseId, GrantedLease>,
-    /// Invalid results.
     rejected: u32,
     /// Shards that failed for good, in a row.
     failed: u32,
-    /// Results that arrived damaged.
     damaged: u32,
     last_seen: Instant,
 }
@@ -140,7 +194,7 @@ impl Session {
             }
             SessionEnd::Replaced => tracing::info!(actor, lost, "actor reconnected"),
             SessionEnd::Closing if self.shared.status.finished() => {
-                let _ = self.outbound.try_send(Ok(handshake::run_is_complete()));
+                let _ = self.outbound.try_send(Ok(run_is_complete()));
             }
             SessionEnd::Closing => {
                 let reason = self.shared.control.stop_requested().map_or_else(String::new, |reason| reason.to_string());
@@ -211,7 +265,7 @@ impl Session {
 
     fn mark_seen(&mut self) {
         self.last_seen = Instant::now();
-        self.shared.roster.mark_seen(self.id, self.last_seen);
+        self.shared.roster.update(self.id, |actor| actor.last_seen = self.last_seen);
     }
 
     /// Sends a message. An actor that reads nothing for the time of a lease counts as silent.
@@ -224,7 +278,6 @@ impl Session {
         }
     }
 
-    /// Grants leases while there are shards and credit.
     async fn grant_leases(&mut self) -> Result<(), SessionEnd> {
         while self.credit > 0 && self.granted.len() < MAX_LEASES {
             let Some(lease) = self.shared.work.with_ledger(|ledger| ledger.lease(self.id)) else { break };

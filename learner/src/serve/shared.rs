@@ -14,18 +14,19 @@
 //! Two changes end the training thread's wait although they are not in the ledger: the last actor leaves, and a stop is
 //! requested. Both happen within [`Work::wake_after`], under the work lock.
 
-use crate::run_events::CollectError;
-use crate::run_events::StopReason;
+use crate::run_events::{CollectError, StopReason};
 use crate::run_identity::RunIdentity;
 use crate::serve::control::Control;
 use crate::serve::events::Events;
-use crate::serve::ledger::SessionId;
+use crate::serve::ledger::{Ledger, SessionId};
 use crate::serve::metrics::LearnerMetrics;
-use crate::serve::roster::{Roster, RosterCounts};
+use crate::serve::roster::Roster;
 use crate::serve::status::RunStatusCache;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board::{Weights, WeightsBoard};
 use crate::serve::work::{CollectedPlan, Work};
+use magex_core::ids::ShardKind;
+use magex_proto::v1;
 use magex_runtime::metrics::Metrics;
 use magex_runtime::status;
 use std::sync::Arc;
@@ -33,7 +34,6 @@ use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) run: RunIdentity,
@@ -49,7 +49,6 @@ pub(crate) struct Shared {
     pub(crate) registry: Arc<Metrics>,
     /// One permit per processor: more concurrent decoders would only hold memory.
     pub(crate) decoders: Semaphore,
-    /// One permit per stream of weights or events.
     watchers: Arc<Semaphore>,
 }
 
@@ -65,8 +64,8 @@ impl Shared {
             roster: Roster::new(limits.max_actors),
             control: Control::new(),
             status: RunStatusCache::new(),
-            board: WeightsBoard::new(),
-            events: Arc::new(Events::new()),
+            board: WeightsBoard::default(),
+            events: Arc::default(),
             metrics,
             registry,
             decoders: Semaphore::new(magex_runtime::process::processors()),
@@ -82,11 +81,8 @@ impl Shared {
     /// A permit for a stream of weights or events, held until the stream ends.
     pub(crate) fn watcher(&self) -> Result<OwnedSemaphorePermit, Status> {
         self.watchers.clone().try_acquire_owned().map_err(|_| {
-            let limit = self.limits.max_watchers;
-            status::resource_exhausted(
-                format!("watchers: the limit of {limit} streams is reached"),
-                Duration::from_secs(5),
-            )
+            let problem = format!("watchers: the limit of {} streams is reached", self.limits.max_watchers);
+            status::resource_exhausted(problem, Duration::from_secs(5))
         })
     }
 
@@ -117,7 +113,6 @@ impl Shared {
         lost
     }
 
-    /// Makes weights the latest version.
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
         self.metrics.weights_version.set(f64::from(weights.version.0));
         self.metrics.weights_bytes.set(weights.bytes.len() as f64);
@@ -125,13 +120,55 @@ impl Shared {
         self.board.publish(weights);
     }
 
-    /// Sets the gauges that are computed on demand, before a scrape.
     pub(crate) fn refresh_gauges(&self) {
-        let RosterCounts { connected, missing, threads, queued_messages } = self.roster.counts();
-        self.metrics.actors_live.set(connected as f64);
-        self.metrics.actors_expected.set((connected + missing) as f64);
-        self.metrics.actor_threads.set(threads as f64);
-        self.metrics.queue("actors", queued_messages);
+        self.roster.refresh(&self.metrics);
         self.metrics.queue("events", self.events.len());
+    }
+
+    /// The answer of `GetRun`.
+    pub(crate) fn run_status(&self) -> v1::RunStatus {
+        let latest = self.board.latest();
+        let sessions = self.roster.sessions();
+        // One lock for the state, the counters and the leases, so that they agree with each other.
+        self.work.inspect(|ledger| {
+            let (done, total) = ledger.progress();
+            let rows = sessions.into_iter().map(|(session, actor)| v1::ActorStatus {
+                leases: ledger.leases_of(session) as u32,
+                last_seen_ms: actor.last_seen.elapsed().as_millis() as u64,
+                ..actor.status
+            });
+            let actors: Vec<v1::ActorStatus> = rows.collect();
+            v1::RunStatus {
+                run_id: self.run.run_id.0.clone(),
+                name: self.run.name.clone(),
+                task_fingerprint: self.run.task_fingerprint.clone(),
+                state: self.run_state(actors.len(), ledger).into(),
+                actors,
+                ledger: Some(ledger.counters()),
+                episodes: Some(ledger.episodes()),
+                shards_done: done as u32,
+                shards_total: total as u32,
+                weights_version: latest.as_ref().map_or(0, |weights| weights.version.0),
+                weights_sha256: latest.as_ref().map_or_else(String::new, |weights| weights.sha256.clone()),
+                ..self.status.reported()
+            }
+        })
+    }
+
+    fn run_state(&self, actors: usize, ledger: &Ledger) -> v1::RunState {
+        let (done, total) = ledger.progress();
+        if self.status.finished() {
+            v1::RunState::Finished
+        } else if self.control.stop_requested().is_some() {
+            v1::RunState::Draining
+        } else if done >= total {
+            v1::RunState::Training
+        } else if actors == 0 {
+            v1::RunState::WaitingForActors
+        } else if ledger.plan().all(|shard| shard.kind == ShardKind::Eval) {
+            v1::RunState::Evaluating
+        } else {
+            v1::RunState::Collecting
+        }
     }
 }

@@ -125,13 +125,11 @@ fn check_recording(limits: &Limits, recording: &Recording) -> Result<(), Convert
         }
     }
     let bound = limits.shape.landmarks.max(limits.shape.bodies);
-    match recording.goals.iter().position(|&goal| goal as usize >= bound) {
-        Some(place) => Err(ConvertError::new(
-            format!("eval.recording.goals[{place}]"),
-            format!("{} is not below {bound}", recording.goals[place]),
-        )),
-        None => Ok(()),
+    if let Some(place) = recording.goals.iter().position(|&goal| goal as usize >= bound) {
+        let problem = format!("{} is not below {bound}", recording.goals[place]);
+        return Err(ConvertError::new(format!("eval.recording.goals[{place}]"), problem));
     }
+    Ok(())
 }
 
 fn check_shape(field: &str, shape: &Shape, limits: &Limits, episodes: usize) -> Result<(), ConvertError> {

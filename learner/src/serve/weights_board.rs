@@ -1,15 +1,15 @@
 //! Publication of the weights: immutable versions, of which the latest two are kept; slow subscribers skip versions.
 
+use crate::serve::patience;
 use magex_core::ids::WeightsVersion;
 use magex_proto::v1::WatchWeightsResponse;
 pub use magex_proto::weights::Weights;
+use magex_runtime::sync::lock;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 use tonic::Status;
-
-use magex_runtime::sync::lock;
 
 /// Number of versions kept: with a policy lag of 1 shards name the version before the latest.
 const KEPT: usize = 2;
@@ -20,7 +20,7 @@ const REMEMBERED: usize = 64;
 type Snapshot = Arc<Vec<Arc<Weights>>>;
 
 /// The trainer publishes versions here; subscribers follow them.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct WeightsBoard {
     /// The latest versions, newest last.
     kept: watch::Sender<Snapshot>,
@@ -29,19 +29,14 @@ pub(crate) struct WeightsBoard {
 }
 
 impl WeightsBoard {
-    pub(crate) fn new() -> Self {
-        Self { kept: watch::Sender::new(Snapshot::default()), published: Mutex::default() }
-    }
-
     /// Makes a version the latest and drops versions that are not older (the learner went back to an earlier checkpoint).
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
-        {
-            let mut published = lock(&self.published);
-            published.insert(weights.version, (weights.sha256.clone(), Instant::now()));
-            while published.len() > REMEMBERED {
-                published.pop_first();
-            }
+        let mut published = lock(&self.published);
+        published.insert(weights.version, (weights.sha256.clone(), Instant::now()));
+        while published.len() > REMEMBERED {
+            published.pop_first();
         }
+        drop(published);
         self.kept.send_modify(|kept| {
             let older = kept.iter().filter(|old| old.version < weights.version).cloned();
             let mut now: Vec<Arc<Weights>> = older.collect();
@@ -55,13 +50,11 @@ impl WeightsBoard {
         self.kept.borrow().last().cloned()
     }
 
-    /// Returns once there is a version.
     pub(crate) async fn first(&self) {
         // This struct owns the sender, so the wait cannot fail.
         let _ = self.kept.subscribe().wait_for(|kept| !kept.is_empty()).await.map(drop);
     }
 
-    /// Whether a version is kept.
     pub(crate) fn is_kept(&self, version: WeightsVersion) -> bool {
         self.kept.borrow().iter().any(|weights| weights.version == version)
     }
@@ -70,7 +63,6 @@ impl WeightsBoard {
         lock(&self.published).get(&version).map(|published| published.0.clone())
     }
 
-    /// When a version was published.
     pub(crate) fn since(&self, version: WeightsVersion) -> Option<Instant> {
         lock(&self.published).get(&version).map(|published| published.1)
     }
@@ -92,20 +84,12 @@ pub(crate) async fn stream(
 ) {
     let mut sent: Option<Arc<Weights>> = None;
     loop {
-        let next = {
-            let kept = board.borrow_and_update();
-            next_version(&kept, sent.as_ref())
-        };
+        let next = next_version(&board.borrow_and_update(), sent.as_ref());
         match next {
             Some(weights) => {
                 for message in weights.messages(&run_config_toml) {
-                    match reader.send_timeout(Ok(message), patience).await {
-                        Ok(()) => {}
-                        Err(mpsc::error::SendTimeoutError::Closed(_)) => return,
-                        Err(mpsc::error::SendTimeoutError::Timeout(_)) => {
-                            tracing::warn!(?patience, "a subscriber of the weights reads nothing; ending its stream");
-                            return;
-                        }
+                    if !patience::send(&reader, message, patience, "a subscriber of the weights").await {
+                        return;
                     }
                 }
                 if sent.is_some() {
@@ -144,7 +128,7 @@ mod tests {
     }
 
     fn published(versions: impl IntoIterator<Item = u32>) -> WeightsBoard {
-        let board = WeightsBoard::new();
+        let board = WeightsBoard::default();
         versions.into_iter().for_each(|version| board.publish(weights(version)));
         board
     }

@@ -3,8 +3,8 @@
 
 use crate::report::bottleneck::CollectTiming;
 use crate::report::shard_timing::ShardTiming;
-use crate::run_events::{CollectError, PlanError, StopReason};
-use crate::serve::ledger::{GivenUp, Lease, Ledger};
+use crate::run_events::{CollectError, StopReason};
+use crate::serve::ledger::{Lease, Ledger};
 use crate::serve::lock_order::{OrderedMutex, Rank};
 use crate::serve::metrics::LearnerMetrics;
 use magex_core::ids::Shard;
@@ -15,16 +15,13 @@ use std::time::Instant;
 use tokio::sync::watch;
 use tracing::Span;
 
-/// What the work lock protects.
 #[derive(Debug)]
 pub(crate) struct OpenWork {
     pub(crate) ledger: Ledger,
     pub(crate) timing: ShardTiming,
-    /// Span of the iteration that is being collected.
     trace: Span,
 }
 
-/// A collected plan.
 #[derive(Debug)]
 pub(crate) struct CollectedPlan {
     /// In the order of the plan.
@@ -34,7 +31,6 @@ pub(crate) struct CollectedPlan {
     pub(crate) ages: Vec<f64>,
 }
 
-/// See the module's documentation.
 #[derive(Debug)]
 pub(crate) struct Work {
     open: OrderedMutex<OpenWork>,
@@ -77,12 +73,10 @@ impl Work {
         value
     }
 
-    /// [`Self::update`] of the ledger alone.
     pub(crate) fn with_ledger<T>(&self, change: impl FnOnce(&mut Ledger) -> T) -> T {
         self.update(|open| change(&mut open.ledger))
     }
 
-    /// Reads the ledger.
     pub(crate) fn inspect<T>(&self, read: impl FnOnce(&Ledger) -> T) -> T {
         read(&self.open.lock().ledger)
     }
@@ -93,7 +87,7 @@ impl Work {
     }
 
     /// Opens a plan within the current span.
-    pub(crate) fn open(&self, plan: Vec<Shard>) -> Result<(), PlanError> {
+    pub(crate) fn open(&self, plan: Vec<Shard>) -> Result<(), CollectError> {
         self.update(|open| {
             open.trace = Span::current();
             open.ledger.open(plan)?;
@@ -118,7 +112,7 @@ impl Work {
                 let (timing, ages) = open.timing.finish(Instant::now());
                 break Ok(CollectedPlan { results, timing, ages });
             }
-            if let Some(GivenUp { shard, reason }) = open.ledger.given_up().cloned() {
+            if let Some((shard, reason)) = open.ledger.given_up().cloned() {
                 break Err(CollectError::Shard { shard, reason });
             }
             if let Some(reason) = stop() {

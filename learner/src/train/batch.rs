@@ -33,21 +33,8 @@ impl Batch {
     pub fn new(seed: u64, spec: &FeatureSpec, trajectories: &[Trajectory]) -> Self {
         let episodes: Vec<(&Trajectory, usize)> =
             trajectories.iter().flat_map(|t| (0..t.shape.episodes).map(move |b| (t, b))).collect();
-        let mut shape = trajectories.first().map_or(
-            Shape {
-                steps: 0,
-                episodes: 0,
-                agents: 0,
-                bodies: 0,
-                landmarks: 0,
-                dims: 0,
-                agent_state: 0,
-                goals_per_agent: 0,
-                action_components: 0,
-            },
-            |t| t.shape,
-        );
-        shape.episodes = episodes.len();
+        let common = trajectories.first().map(|t| t.shape).unwrap_or_default();
+        let shape = Shape { episodes: episodes.len(), ..common };
         let features = episodes.par_iter().map(|(t, b)| episode_features(spec, t, *b)).collect();
         let rows = episodes.len() * shape.steps * shape.agents;
         let mut batch = Self {
@@ -58,14 +45,13 @@ impl Batch {
             rewards: Vec::with_capacity(rows),
             noise: Vec::with_capacity(episodes.len()),
         };
+        let (n, h) = (shape.agents, shape.action_components);
         for (t, b) in &episodes {
             for step in 0..shape.steps {
-                let at = (step * t.shape.episodes + b) * shape.agents;
-                batch.actions.extend_from_slice(
-                    &t.actions[at * shape.action_components..(at + shape.agents) * shape.action_components],
-                );
-                batch.log_probs.extend_from_slice(&t.log_probs[at..at + shape.agents]);
-                batch.rewards.extend_from_slice(&t.rewards[at..at + shape.agents]);
+                let at = (step * t.shape.episodes + b) * n;
+                batch.actions.extend_from_slice(&t.actions[at * h..(at + n) * h]);
+                batch.log_probs.extend_from_slice(&t.log_probs[at..at + n]);
+                batch.rewards.extend_from_slice(&t.rewards[at..at + n]);
             }
             batch.noise.push(episode_keys(seed, &t.shard, *b as u32).graph.stream().bits64());
         }
@@ -73,7 +59,7 @@ impl Batch {
     }
 
     /// Features of `steps` steps from `start` of several episodes, ordered [L, C, N].
-    pub fn gather(&self, units: &[(usize, usize)], steps: usize) -> Features {
+    fn gather(&self, units: &[(usize, usize)], steps: usize) -> Features {
         let (n, rows) = (self.shape.agents, (self.shape.steps + 1) * self.shape.agents);
         let mut out = Features::default();
         for l in 0..steps {
@@ -85,14 +71,14 @@ impl Batch {
     }
 
     /// Noise keys of the same states, ordered [L, C].
-    pub fn noise_keys(&self, units: &[(usize, usize)], steps: usize) -> Vec<u64> {
+    fn noise_keys(&self, units: &[(usize, usize)], steps: usize) -> Vec<u64> {
         (0..steps)
             .flat_map(|l| units.iter().map(move |&(episode, start)| sequence(self.noise[episode], (start + l) as u32)))
             .collect()
     }
 
     /// Rows of a [E, T, N, width] array for the same states, ordered [L, C, N, width].
-    pub fn rows<T: Copy>(&self, data: &[T], width: usize, units: &[(usize, usize)], steps: usize) -> Vec<T> {
+    pub(crate) fn rows<T: Copy>(&self, data: &[T], width: usize, units: &[(usize, usize)], steps: usize) -> Vec<T> {
         let block = self.shape.agents * width;
         let mut out = Vec::with_capacity(units.len() * steps * block);
         for l in 0..steps {

@@ -22,10 +22,10 @@ use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
 use magex_nets::ops::{self, Pick};
 use magex_nets::params::{ParamBuilder, ParamError};
+use std::slice::from_ref;
 
 pub use imitation::Lesson;
 
-/// Name of the scheduler's network.
 const NAME: &str = "commander";
 
 /// One team and what was decided for it.
@@ -124,8 +124,7 @@ impl CommanderPpo {
                         continue;
                     }
                     ratio_sum += greedy / exact;
-                    let log_probs =
-                        commander.pick_log_probs(std::slice::from_ref(&instance), std::slice::from_ref(&picks))?;
+                    let log_probs = commander.pick_log_probs(from_ref(&instance), from_ref(&picks))?;
                     let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
                     error = error.max(f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64);
                     samples.push(Sample { instance, picks, advantage: advantage as f32 });
@@ -220,14 +219,11 @@ impl CommanderPpo {
     /// Log-probabilities of every pick under the present weights.
     fn log_probs_of(&self, network: &Network, samples: &[Sample]) -> Result<Vec<Vec<f32>>, CommanderError> {
         let commander = self.commander(network)?;
-        samples
-            .iter()
-            .map(|s| {
-                let both =
-                    commander.pick_log_probs(std::slice::from_ref(&s.instance), std::slice::from_ref(&s.picks))?;
-                Ok(both.get(0)?.to_vec1::<f32>()?)
-            })
-            .collect()
+        let of = |s: &Sample| {
+            let both = commander.pick_log_probs(from_ref(&s.instance), from_ref(&s.picks))?;
+            Ok(both.get(0)?.to_vec1::<f32>()?)
+        };
+        samples.iter().map(of).collect()
     }
 }
 
@@ -248,7 +244,7 @@ fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Vec<u32>> {
 
 /// C of the most likely decision.
 pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) -> Result<f64, CommanderError> {
-    let scores = commander.scores(std::slice::from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
+    let scores = commander.scores(from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
     Ok(cost(team, &instance.decide(&scores, None).0.goals))
 }
 

@@ -32,6 +32,9 @@ use rayon::prelude::*;
 
 type Result<T> = std::result::Result<T, ParamError>;
 
+/// The gradient of each network, as flat as its parameters; empty for networks that a loss does not read.
+type Gradients = Vec<Vec<f32>>;
+
 /// The algorithm with its settings.
 #[derive(Debug)]
 pub struct Mappo {
@@ -146,8 +149,8 @@ impl Mappo {
 
                 // 6. If a loss is not finite, skip the update of all networks; `value_norm` has taken in the minibatch by then.
                 let mut sums = PolicySums::default();
-                policy.iter().for_each(|slice| sums.add(&slice.sums));
-                let value_sum = value.iter().map(|slice| slice.sum).sum::<f64>();
+                policy.iter().for_each(|(_, slice)| sums.add(slice));
+                let value_sum = value.iter().map(|(_, slice)| slice).sum::<f64>();
                 if !(sums.loss.is_finite() && value_sum.is_finite()) {
                     total.skipped += 1.0;
                     continue;
@@ -156,7 +159,7 @@ impl Mappo {
                 // 7. Clip by global norm, step. If only the gradient of one network is not finite, skip that network.
                 let mut norms = vec![0.0; parts.len()];
                 for (k, (network, part)) in networks.iter_mut().zip(parts).enumerate() {
-                    let gradients = policy.iter().map(|s| &s.gradients[k]).chain(value.iter().map(|s| &s.gradients[k]));
+                    let gradients = policy.iter().map(|(g, _)| &g[k]).chain(value.iter().map(|(g, _)| &g[k]));
                     let rate = if part.policy { m.actor_learning_rate } else { m.critic_learning_rate } * decay;
                     let (values, limit) = (&mut network.params.values, m.max_grad_norm.into());
                     norms[k] = network.adam.step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit);
@@ -214,7 +217,7 @@ impl Mappo {
         slice: &Slice<'_>,
         evaluations: &[Evaluation],
         advantages: &[f32],
-    ) -> Result<PolicyGradient> {
+    ) -> Result<(Gradients, PolicySums)> {
         let m = &self.config.mappo;
         let (variables, mut parts) = self.variables(networks, |part| part.policy)?;
         let policy = self.model.policy(&mut parts)?;
@@ -229,10 +232,10 @@ impl Mappo {
         let loss = (objective.sum_all()? * (-1.0 / f64::from(slice.samples)))?;
 
         let sums = PolicySums::of(&surrogate, &now.entropies, &ratio, &log_ratio, m.clip_epsilon)?;
-        Ok(PolicyGradient { gradients: gradients(networks, &variables, &loss)?, sums })
+        Ok((gradients(networks, &variables, &loss)?, sums))
     }
 
-    /// Loss of the value function on one slice of a minibatch: [`clipped_value_loss`] in normalised units.
+    /// Loss of the value function on one slice of a minibatch: [`clipped_value_loss`] in normalised units, and its sum.
     fn value_loss(
         &self,
         networks: &[Network],
@@ -241,7 +244,7 @@ impl Mappo {
         returns: &[f32],
         old_values: &[f32],
         (mean, deviation): (f32, f32),
-    ) -> Result<ValueGradient> {
+    ) -> Result<(Gradients, f64)> {
         let m = &self.config.mappo;
         let (variables, mut parts) = self.variables(networks, |part| part.value)?;
         let value = self.model.value(&mut parts)?;
@@ -254,7 +257,7 @@ impl Mappo {
         let losses = clipped_value_loss(&values, &old_values, &targets, m.clip_epsilon, m.huber_delta)?;
         let loss = (losses.sum_all()? * (1.0 / f64::from(slice.samples)))?;
 
-        Ok(ValueGradient { gradients: gradients(networks, &variables, &loss)?, sum: sum(&losses)? })
+        Ok((gradients(networks, &variables, &loss)?, sum(&losses)?))
     }
 
     /// Variables of the parts that a loss reads (none of the others), and a builder for each part.
@@ -289,24 +292,10 @@ fn huber(error: &Tensor, delta: f32) -> CandleResult<Tensor> {
     &inner * (size - (&inner * 0.5)?)?
 }
 
-/// Backward; the gradient of each network as flat as its parameters, empty for networks that the loss does not read.
-fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Result<Vec<Vec<f32>>> {
+fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Result<Gradients> {
     let store = loss.backward()?;
     let flat = |(network, variables): (&Network, &Vec<Var>)| Ok(network.params.gradient(variables, &store)?);
     networks.iter().zip(variables).map(flat).collect()
-}
-
-/// What one slice adds to a minibatch.
-struct PolicyGradient {
-    gradients: Vec<Vec<f32>>,
-    sums: PolicySums,
-}
-
-/// What one slice adds to a minibatch.
-struct ValueGradient {
-    gradients: Vec<Vec<f32>>,
-    /// Σ of the value loss over its rows.
-    sum: f64,
 }
 
 /// Sums over rows, in order and in double precision.

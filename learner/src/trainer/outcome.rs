@@ -1,7 +1,8 @@
 //! How training ends.
 
 use crate::checkpoint::CheckpointError;
-use crate::report::metrics_file::{FileError, Summary};
+use crate::report::observer::FileError;
+use crate::report::records::Summary;
 use crate::run_events::{CollectError, StopReason};
 use magex_core::config::ConfigError;
 use magex_nets::commander::CommanderError;
@@ -28,17 +29,10 @@ pub enum TrainError {
     File(#[from] FileError),
     /// The run is complete, but its last files cannot be written.
     #[error(
-        "{path}: {error}, for {waited} s; free disk space or fix the permissions, then continue with --resume, which repeats \
-         only the end of the run"
+        "{0}, for {1} s; free disk space or fix the permissions, then continue with --resume, which repeats only the end of \
+         the run"
     )]
-    LastFiles {
-        /// The file.
-        path: PathBuf,
-        /// The system's error.
-        error: std::io::Error,
-        /// How long writing was retried, seconds.
-        waited: u64,
-    },
+    LastFiles(FileError, u64),
     /// The closing evaluation returned no episodes.
     #[error("results: the final evaluation returned no episodes")]
     EmptyEvaluation,
@@ -48,12 +42,9 @@ pub enum TrainError {
     /// The run folder belongs to another configuration.
     #[error(
         "{}: the checkpoint was made with another configuration; resume without a configuration file, or start a new run",
-        .folder.display()
+        .0.display()
     )]
-    OtherConfiguration {
-        /// The run folder.
-        folder: PathBuf,
-    },
+    OtherConfiguration(PathBuf),
     /// The configuration could not be serialised.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -65,7 +56,7 @@ pub enum TrainError {
 impl TrainError {
     /// Whether the configuration or the command line is at fault, not the run.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::OtherConfiguration { .. } | Self::Config(_) | Self::Threads(_))
+        matches!(self, Self::OtherConfiguration(_) | Self::Config(_) | Self::Threads(_))
     }
 }
 

@@ -3,7 +3,6 @@
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 
-/// Limit of the episodes of an evaluation shard.
 const EVAL_SHARD_EPISODES: u32 = 16;
 /// Evaluation set while training.
 pub const EVAL_SET_TRAINING: u32 = 1;
@@ -15,7 +14,6 @@ pub fn max_shard_episodes(config: &RunConfig) -> u32 {
     (config.collect.episodes_per_iteration / config.collect.shards_per_iteration).max(EVAL_SHARD_EPISODES)
 }
 
-/// The training shards of an iteration.
 pub(super) fn training(config: &RunConfig, iteration: u32) -> impl Iterator<Item = Shard> + use<> {
     let shards = config.collect.shards_per_iteration;
     let episodes = config.collect.episodes_per_iteration / shards;

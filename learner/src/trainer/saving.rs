@@ -4,9 +4,9 @@ use super::{TrainError, Trainer};
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::checkpoint::{self, Progress};
 use crate::collector::Collector;
-use crate::report::metrics_file::FileError;
+use crate::report::observer::FileError;
 use crate::run_events::{RunEvent, StopReason};
-use magex_core::ids::Iteration;
+use magex_proto::v1::CheckpointEvent;
 use magex_runtime::backoff::Backoff;
 use magex_runtime::trace;
 use std::path::PathBuf;
@@ -20,7 +20,7 @@ impl Trainer {
     /// attempted on schedule, and a resume repeats the iterations in between with the same bits.
     pub(super) fn save(&mut self) {
         let _span = tracing::info_span!(target: trace::TARGET, "checkpoint").entered();
-        let (iteration, clock) = (Iteration(self.progress.iteration), Instant::now());
+        let (iteration, clock) = (self.progress.iteration, Instant::now());
         let written = self.checkpoint();
         let (took, folder) = (clock.elapsed(), written.as_deref().ok());
         self.notify(|observer| observer.checkpoint(took, folder));
@@ -30,12 +30,12 @@ impl Trainer {
                     tracing::info!(failed = self.failed_checkpoints, "checkpoints can be written again");
                 }
                 self.failed_checkpoints = 0;
-                self.event(&RunEvent::Checkpoint { iteration, path: path.display().to_string() });
+                self.event(&RunEvent::Checkpoint(CheckpointEvent { iteration, path: path.display().to_string() }));
             }
             Err(error) => {
                 self.failed_checkpoints += 1;
                 let failed = self.failed_checkpoints;
-                tracing::error!(%error, iteration = iteration.0, failed, "checkpoint failed; the previous one remains valid, the next is attempted on schedule");
+                tracing::error!(%error, iteration, failed, "checkpoint failed; the previous one remains valid, the next is attempted on schedule");
                 let text = format!(
                     "no checkpoint of iteration {iteration}: {error}; {failed} failed in a row, the previous one remains valid"
                 );
@@ -55,8 +55,7 @@ impl Trainer {
         loop {
             let Err(error) = self.write_files(files) else { return Ok(None) };
             if start.elapsed() >= LAST_FILES_PATIENCE {
-                let FileError { path, error } = error;
-                return Err(TrainError::LastFiles { path, error, waited: LAST_FILES_PATIENCE.as_secs() });
+                return Err(TrainError::LastFiles(error, LAST_FILES_PATIENCE.as_secs()));
             }
             if !reported {
                 reported = true;

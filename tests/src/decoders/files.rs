@@ -5,8 +5,9 @@ use bytes::Bytes;
 use magex_commander::run_scheduler::load_scheduler;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
+use magex_core::sha256;
 use magex_core::trajectory::ShardResult;
-use magex_learner::checkpoint::{self, Progress, sha256_hex};
+use magex_learner::checkpoint::{self, Progress};
 use magex_learner::serve::validate::{Limits, validate};
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
@@ -91,8 +92,8 @@ impl Run {
         write(&folder.join(file), content);
         if agrees && file != "manifest.json" {
             let manifest = std::fs::read_to_string(folder.join("manifest.json")).expect("a manifest");
-            let before = sha256_hex(&std::fs::read(self.checkpoint.join(file)).expect("a file"));
-            write(&folder.join("manifest.json"), manifest.replace(&before, &sha256_hex(content)).as_bytes());
+            let before = sha256::hex(&std::fs::read(self.checkpoint.join(file)).expect("a file"));
+            write(&folder.join("manifest.json"), manifest.replace(&before, &sha256::hex(content)).as_bytes());
         }
         match checkpoint::read(&folder, &self.learned) {
             Ok((_, learned)) => {

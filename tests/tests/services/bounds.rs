@@ -116,7 +116,7 @@ impl Worker for Flaky {
         &mut self,
         shard: &Shard,
         weights: &Weights,
-        _: &mut dyn magex_actor::goal_client::GoalSource,
+        _: &mut magex_actor::goal_client::GrpcGoals,
     ) -> Result<ShardResult, WorkError> {
         let ShardResult::Train(mut trajectory) = result_of(&task(), shard, &weights.bytes) else { panic!("training") };
         if self.0.fetch_add(1, Ordering::SeqCst) % 10 == 9 {
@@ -146,7 +146,7 @@ async fn an_actor_whose_results_are_garbage_now_and_then_is_evicted_and_nothing_
         iteration += 1;
     }
     let error = bad.end().await.unwrap_err();
-    assert!(matches!(&error, ActorError::Evicted { reason, .. } if reason.contains("NaN is not finite")), "{error}");
+    assert!(matches!(&error, ActorError::Evicted(_, reason) if reason.contains("NaN is not finite")), "{error}");
     assert_eq!(learner.ledger().rejected, 3);
     // Another actor does the rest.
     let good = Actor::start(&learner.url, "good", FakeWorker::default());

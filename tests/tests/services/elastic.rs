@@ -145,7 +145,7 @@ async fn an_actor_that_can_do_nothing_is_evicted_and_the_others_go_on() {
     learner.collector.open(plan(0, 2)).unwrap();
     // The good one has its hands full with one of the two.
     let error = broken.end().await.unwrap_err();
-    assert!(matches!(&error, ActorError::Evicted { reason, .. } if reason.contains("no instruction")), "{error}");
+    assert!(matches!(&error, ActorError::Evicted(_, reason) if reason.contains("no instruction")), "{error}");
     gate.cancel();
     assert_eq!(learner.finish().await.unwrap(), expected(&plan(0, 2)));
     assert_eq!(learner.ledger().failed, 3);

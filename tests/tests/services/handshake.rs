@@ -13,7 +13,7 @@ async fn a_wrong_task_is_refused_with_both_sides_named() {
     let learner = Learner::start().await;
     let config = ActorConfig { expected_task: Some("fade".into()), ..config(&learner.url, "a") };
     let error = Actor::start_with(config, FakeWorker::default()).end().await.unwrap_err();
-    assert!(matches!(error, ActorError::Refused { .. }));
+    assert!(matches!(error, ActorError::Refused(..)));
     let text = error.to_string();
     assert!(text.contains("task fade") && text.contains(&task().fingerprint()), "{text}");
     let config = ActorConfig { expected_task: Some(task().fingerprint()), ..crate::sandbox::config(&learner.url, "b") };

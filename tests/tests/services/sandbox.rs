@@ -1,7 +1,7 @@
 //! A learner, a commander and actors in this process, and an actor that a test plays itself.
 
 use bytes::Bytes;
-use magex_actor::goal_client::{GoalRequest, GoalSource};
+use magex_actor::goal_client::{GoalRequest, GrpcGoals};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
 use magex_commander::scheduler::{GoalReply, LoadScheduler, Scheduler, SchedulerError, TeamReply};
@@ -238,7 +238,7 @@ pub(crate) fn goal_request(task: &TaskConfig, shard: &Shard) -> GoalRequest {
 }
 
 impl Worker for FakeWorker {
-    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut dyn GoalSource) -> Result<ShardResult, WorkError> {
+    fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         if let Some(fail) = self.fail {
             fail(shard)?;
         }
@@ -269,7 +269,7 @@ impl Actor {
 
     pub(crate) fn start_maker(config: ActorConfig, maker: MakeWorker) -> Self {
         let shutdown = CancellationToken::new();
-        let running = tokio::spawn(magex_actor::run::run(config, maker, shutdown.clone()));
+        let running = tokio::spawn(magex_actor::run::run(config, maker, Arc::default(), shutdown.clone()));
         Self { shutdown, running }
     }
 

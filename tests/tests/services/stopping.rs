@@ -1,10 +1,10 @@
 //! Shutdown: within its budget, whatever clients do, and with a notice to every client.
 
 use crate::sandbox::*;
-use magex_core::ids::{Iteration, RunId};
+use magex_core::ids::RunId;
 use magex_learner::collector::Collector as _;
 use magex_learner::report::observer::{RunObserver as _, RunStart};
-use magex_learner::run_events::{CollectError, IterationReport, RunEvent, StopReason};
+use magex_learner::run_events::{CollectError, RunEvent, StopReason};
 use magex_proto::v1;
 use magex_proto::v1::watch_run_response::Event;
 use std::path::Path;
@@ -39,8 +39,8 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     let mut learner = Learner::start().await;
     let actor = Actor::start(&learner.url, "a", FakeWorker::default());
     learner.iterate(0, 2).await.unwrap();
-    let report = IterationReport {
-        iteration: Iteration(1),
+    let report = v1::IterationEvent {
+        iteration: 1,
         joint_env_steps: 12,
         success: Some(0.5),
         reward: None,
@@ -54,7 +54,7 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     let mut events = client.watch_run(v1::WatchRunRequest {}).await.unwrap().into_inner();
     let first = within(events.message()).await.unwrap().unwrap();
     assert!(matches!(first.event, Some(Event::Iteration(event)) if event.metrics_json == "{\"x\":1}"));
-    learner.handle.observer().event(&RunEvent::Finished { summary_json: "{}".into() });
+    learner.handle.observer().event(&RunEvent::Finished(v1::FinishedEvent { summary_json: "{}".into() }));
     assert_eq!(learner.handle.status().state(), v1::RunState::Finished);
     learner.shutdown.cancel();
     assert!(matches!(within(events.message()).await.unwrap().unwrap().event, Some(Event::Finished(_))));
@@ -112,8 +112,8 @@ async fn a_drain_without_actors_ends_the_iteration() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_resumed_run_reports_its_last_iteration_at_once() {
     let learner = Learner::start().await;
-    let before = IterationReport {
-        iteration: Iteration(7),
+    let before = v1::IterationEvent {
+        iteration: 7,
         joint_env_steps: 70,
         success: Some(0.5),
         reward: Some(-1.0),

@@ -5,6 +5,7 @@ use crate::options::CommonOptions;
 use crate::output::{Table, note};
 use anyhow::Context as _;
 use magex_core::rng::{Key, Purpose};
+use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::exit;
@@ -59,31 +60,30 @@ pub(crate) struct AssignArgs {
     pub(crate) seed: Option<u64>,
 }
 
-/// Assignment methods.
+/// Assignment methods, with their numbers on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Kind {
     /// The trained commander.
-    Learned,
+    Learned = v1::AssignmentMethod::Learned as isize,
     /// Minimal summed distance.
-    Exact,
+    Exact = v1::AssignmentMethod::Exact as isize,
     /// The nearest free pair, repeatedly.
-    Greedy,
+    Greedy = v1::AssignmentMethod::Greedy as isize,
     /// A random matching.
-    Random,
+    Random = v1::AssignmentMethod::Random as isize,
     /// Minimal longest distance.
-    Makespan,
+    Makespan = v1::AssignmentMethod::Makespan as isize,
 }
 
-/// How goals are chosen.
+/// How goals are chosen, with their numbers on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Choice {
     /// The most likely ones.
-    Greedy,
+    Greedy = v1::Mode::Greedy as isize,
     /// Sampled.
-    Sampled,
+    Sampled = v1::Mode::Sampled as isize,
 }
 
-/// Agents and goals.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Team {
@@ -96,12 +96,8 @@ pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<
     let request = v1::AssignRequest {
         agents: Some(positions("agents", &team.agents)?),
         goals: Some(positions("goals", &team.goals)?),
-        scheduler: scheduler(args.scheduler).into(),
-        mode: match args.mode {
-            Choice::Greedy => v1::Mode::Greedy,
-            Choice::Sampled => v1::Mode::Sampled,
-        }
-        .into(),
+        scheduler: args.scheduler as i32,
+        mode: args.mode as i32,
         seed: args.seed,
         ..Default::default()
     };
@@ -153,12 +149,14 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
             output.say(format!("  unassigned {what}: {}", list.join(", ")));
         }
     }
-    let answered = kind_name(response.scheduler());
-    let version = match response.sha256.is_empty() {
-        true => String::new(),
-        false => {
-            format!(" (version {}, weights {})", response.version, &response.sha256[..12.min(response.sha256.len())])
-        }
+    let answered = match response.scheduler() {
+        v1::AssignmentMethod::Unspecified => "unknown",
+        method => AssignmentMethod::from(method).name(),
+    };
+    let weights = &response.sha256[..12.min(response.sha256.len())];
+    let version = match weights {
+        "" => String::new(),
+        _ => format!(" (version {}, weights {weights})", response.version),
     };
     output.say(format!(
         "\n  summed distance {:.4}, minimum {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
@@ -170,10 +168,8 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
         1e3 * round_trip
     ));
     if !response.fallback_reason.is_empty() {
-        note(
-            format!("note: {answered} answered instead of {:?}: {}", args.scheduler, response.fallback_reason)
-                .to_lowercase(),
-        );
+        let reason = &response.fallback_reason;
+        note(format!("note: {answered} answered instead of {:?}: {reason}", args.scheduler).to_lowercase());
     }
     let pairs = response.pairs.iter().map(|p| {
         json!({ "agent": p.agent_index, "goal": p.goal_index, "distance": p.distance, "probability": p.probability })
@@ -194,27 +190,6 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
         "seconds": response.seconds,
         "round_trip_seconds": round_trip,
     }));
-}
-
-fn scheduler(kind: Kind) -> v1::AssignmentMethod {
-    match kind {
-        Kind::Learned => v1::AssignmentMethod::Learned,
-        Kind::Exact => v1::AssignmentMethod::Exact,
-        Kind::Greedy => v1::AssignmentMethod::Greedy,
-        Kind::Random => v1::AssignmentMethod::Random,
-        Kind::Makespan => v1::AssignmentMethod::Makespan,
-    }
-}
-
-fn kind_name(kind: v1::AssignmentMethod) -> &'static str {
-    match kind {
-        v1::AssignmentMethod::Learned => "learned",
-        v1::AssignmentMethod::Exact => "exact",
-        v1::AssignmentMethod::Greedy => "greedy",
-        v1::AssignmentMethod::Random => "random",
-        v1::AssignmentMethod::Makespan => "makespan",
-        v1::AssignmentMethod::Unspecified => "unknown",
-    }
 }
 
 fn team(args: &AssignArgs) -> anyhow::Result<Team> {

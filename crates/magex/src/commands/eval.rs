@@ -1,9 +1,8 @@
 //! `magex eval`
 
 use crate::artifacts;
-use crate::evaluate::{self, Controller, EVAL_SET, Episodes, Modes, Variation, mode_name, roll_out};
+use crate::evaluate::{Controller, Episodes, Modes, Subject, mode_name, roll_out};
 use crate::failure::usage;
-use crate::folder;
 use crate::options::CommonOptions;
 use crate::output::{Table, note, seconds};
 use crate::settings;
@@ -13,7 +12,9 @@ use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::means::{EvalSummary, summarise};
 use magex_runtime::exit;
-use serde_json::{Map, Value, json};
+use magex_runtime::process::processors;
+use serde::Serialize;
+use serde_json::{Map, json};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -38,38 +39,29 @@ Exit codes: 0 success, 1 evaluation failed, 64 wrong usage or configuration";
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub(crate) struct EvalArgs {
-    /// Run folder, or a weights file together with --config.
-    #[arg(value_name = "RUN")]
-    pub(crate) run: PathBuf,
-    /// Configuration of a weights file.
-    #[arg(long, value_name = "FILE")]
-    pub(crate) config: Option<PathBuf>,
     /// Episodes per row.
     #[arg(long, value_name = "K", default_value_t = 100, value_parser = settings::count)]
-    pub(crate) episodes: u32,
+    episodes: u32,
     /// Seeds of the episodes, one row per seed and mode [default: the seed of the run].
     #[arg(long, value_name = "S,…", value_delimiter = ',')]
-    pub(crate) episode_seeds: Vec<u64>,
+    episode_seeds: Vec<u64>,
     /// The former name of --episode-seeds.
     #[arg(long, value_name = "S,…", hide = true, value_parser = renamed)]
     seeds: Option<String>,
     /// How actions and goals are chosen [default: both; greedy for the scripted controller].
     #[arg(long, value_enum, value_name = "MODE")]
-    pub(crate) mode: Option<Modes>,
+    mode: Option<Modes>,
     /// One row per layout (spawn modes lines and authors).
     #[arg(long)]
-    pub(crate) per_layout: bool,
-    /// Evaluation set: selects the starts; 3 or more.
-    #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = evaluate::eval_set)]
-    pub(crate) eval_set: u32,
+    per_layout: bool,
     /// Rollout threads [default: the cores of this machine].
     #[arg(long, value_name = "T", value_parser = settings::threads)]
-    pub(crate) threads: Option<usize>,
+    threads: Option<usize>,
     /// Write a replay of the first episode of the first row.
     #[arg(long, value_name = "FILE.html")]
-    pub(crate) record: Option<PathBuf>,
+    record: Option<PathBuf>,
     #[command(flatten)]
-    pub(crate) vary: Variation,
+    subject: Subject,
 }
 
 /// Rejects `--seeds`, which could be mistaken for the seeds of training runs.
@@ -77,29 +69,29 @@ fn renamed(_: &str) -> Result<String, String> {
     Err("this option is now called --episode-seeds".into())
 }
 
-/// One line of the table.
+#[derive(Serialize)]
 struct Row {
     seed: u64,
     mode: Mode,
     spawn: Spawn,
+    #[serde(flatten)]
     summary: EvalSummary,
     wall_s: f64,
 }
 
 pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let output = options.output();
-    let trained = folder::load(&args.run, args.config.as_deref())?;
-    trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
-    let config = args.vary.apply(&trained)?;
-    let scheduler = args.vary.scheduler_of(&config);
-    let modes = args.mode.unwrap_or(match args.vary.controller {
+    let (trained, config) = args.subject.load()?;
+    let vary = &args.subject.vary;
+    let scheduler = vary.scheduler_of(&config);
+    let modes = args.mode.unwrap_or(match vary.controller {
         Controller::Learned => Modes::Both,
         Controller::Scripted => Modes::Greedy,
     });
     let seeds = if args.episode_seeds.is_empty() { vec![config.run.seed] } else { args.episode_seeds.clone() };
     let spawns = layouts(config.task.spawn, args.per_layout)?;
-    let threads = args.threads.unwrap_or_else(settings::cores);
-    let driver = match args.vary.controller {
+    let threads = args.threads.unwrap_or_else(processors);
+    let driver = match vary.controller {
         Controller::Learned => format!("executor {}", config.executor.kind),
         Controller::Scripted => "scripted controller".to_owned(),
     };
@@ -117,11 +109,11 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         for &seed in &seeds {
             let mut config = config.clone();
             (config.run.seed, config.task.spawn) = (seed, spawn);
-            let policy = args.vary.policy(&config, &trained.weights)?;
+            let policy = vary.policy(&config, &trained.weights)?;
             for &mode in modes.list() {
                 let clock = Instant::now();
                 let record = u32::from(args.record.is_some() && rows.is_empty());
-                let episodes = Episodes { count: args.episodes, set: args.eval_set, mode, record };
+                let episodes = Episodes { count: args.episodes, set: args.subject.eval_set, mode, record };
                 let (metrics, recordings) = roll_out(&policy, &config, episodes, threads)?;
                 if let (Some(path), Some(recording)) = (&args.record, recordings.into_iter().next()) {
                     let subtitle = format!("{} · {} evaluation", artifacts::describe(&config), mode_name(mode));
@@ -155,22 +147,21 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
     output.say(table.to_string());
     note(format!("{} with {threads} threads", seconds(rows.iter().map(|row| row.wall_s).sum())));
     output.result(&json!({
-        "run": args.run,
+        "run": args.subject.run,
         "weights_sha256": trained.sha256,
         "task": config.task.name,
         "agents": config.task.agents,
         "horizon": config.task.horizon,
         "executor": config.executor.kind,
         "scheduler": scheduler,
-        "controller": format!("{:?}", args.vary.controller).to_lowercase(),
-        "eval_set": args.eval_set,
-        "rows": rows.iter().map(value).collect::<Result<Vec<_>, _>>()?,
+        "controller": format!("{:?}", vary.controller).to_lowercase(),
+        "eval_set": args.subject.eval_set,
+        "rows": rows,
         "mean": means,
     }));
     Ok(exit::OK)
 }
 
-/// The spawn modes of the rows.
 fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
     match spawn {
         _ if !each => Ok(vec![spawn]),
@@ -185,15 +176,4 @@ fn cells(task: &TaskConfig, [spawn, seed]: [String; 2], mode: Mode, summary: &Ev
     let metrics = METRICS.iter().zip(summary.means).filter(|(metric, _)| metric.applies(task));
     let values = metrics.map(|(metric, mean)| mean.map_or_else(String::new, |mean| metric.write(mean)));
     [spawn, seed, mode_name(mode).into(), summary.episodes.to_string()].into_iter().chain(values).collect()
-}
-
-fn value(row: &Row) -> serde_json::Result<Value> {
-    let mut value = serde_json::to_value(row.summary)?;
-    if let Value::Object(map) = &mut value {
-        map.insert("seed".into(), json!(row.seed));
-        map.insert("mode".into(), json!(mode_name(row.mode)));
-        map.insert("spawn".into(), json!(row.spawn));
-        map.insert("wall_s".into(), json!(row.wall_s));
-    }
-    Ok(value)
 }

@@ -3,7 +3,7 @@
 use crate::artifacts::{run_name, write_curve, write_recorded_replay};
 use crate::failure::{coded, usage};
 use crate::folder;
-use crate::local::{EventChannel, LocalCollector};
+use crate::local::LocalCollector;
 use crate::options::CommonOptions;
 use crate::output::{Output, note, program, seconds, thousands};
 use crate::progress::Progress;
@@ -13,8 +13,9 @@ use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
-use magex_learner::report::metrics_file::Summary;
+use magex_learner::report::records::Summary;
 use magex_learner::trainer::{TrainError, TrainOutcome, Trainer};
+use magex_runtime::process::processors;
 use magex_runtime::{backoff, exit, http, server, shutdown};
 use magex_viewer::page::{LivePage, RunInfo};
 use serde_json::{Value, json};
@@ -156,7 +157,6 @@ struct Plan {
     http: Option<String>,
     /// The actor processes; `None` to train in this process.
     actors: Option<ActorPlan>,
-    /// How it is trained, for display.
     title: String,
 }
 
@@ -170,11 +170,11 @@ fn prepare(args: &TrainArgs, config: RunConfig) -> anyhow::Result<Plan> {
     if !args.resume {
         folder::create(&folder, &config)?;
     }
-    let threads = args.threads.unwrap_or_else(settings::cores);
+    let threads = args.threads.unwrap_or_else(processors);
     let (actors, title) = if args.in_process {
         (None, format!("one process, {threads} threads"))
     } else {
-        let plan = ActorPlan { actors: args.actors, threads: (settings::cores() / args.actors).max(1) };
+        let plan = ActorPlan { actors: args.actors, threads: (processors() / args.actors).max(1) };
         (Some(plan), format!("learner, commander and {} actors on this machine", args.actors))
     };
     Ok(Plan { config, folder, resume: args.resume, threads, http, actors, title })
@@ -237,7 +237,7 @@ fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) 
     }
 
     let (events, received) = mpsc::channel();
-    trainer.observe(EventChannel(events));
+    trainer.observe(events);
     let mut collector = LocalCollector::new(&plan.config, plan.threads, stop);
     let outcome = std::thread::scope(|scope| {
         let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);
@@ -268,7 +268,7 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
     }
     let command_s = started.elapsed().as_secs_f64();
     // Until the last iteration was reported: the one that reached the target, if it was reached.
-    let training_s = progress.last_iteration().map(|end| (end - started).as_secs_f64());
+    let training_s = progress.last_iteration.map(|end| (end - started).as_secs_f64());
     let path = plan.folder.join(folder::SUMMARY);
     let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     let mut value: Value = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
@@ -302,7 +302,7 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
         map.insert("target_wall_s".into(), json!(training_s));
         map.insert("out".into(), json!(plan.folder));
         map.insert("in_process".into(), json!(plan.actors.is_none()));
-        map.insert("page".into(), json!(progress.page_url()));
+        map.insert("page".into(), json!(progress.page));
     }
     output.result(&value);
     Ok(exit::OK)

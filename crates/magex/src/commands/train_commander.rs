@@ -15,12 +15,13 @@ use magex_assign::exact_points;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
+use magex_core::sha256;
 use magex_core::task::Spawn;
-use magex_learner::checkpoint::sha256_hex;
 use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
 use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
 use magex_runtime::exit;
+use magex_runtime::process::processors;
 use serde_json::{Value, json};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -76,7 +77,6 @@ const VALIDATION: u32 = 5;
 const VALIDATION_SIZES: [usize; 5] = [5, 20, 50, 100, 200];
 const VALIDATION_INSTANCES: u32 = 32;
 
-/// Lines of metrics.jsonl.
 const MEASUREMENTS: u32 = 20;
 
 pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow::Result<u8> {
@@ -96,7 +96,7 @@ pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow:
     let training = Training {
         ppo: CommanderPpo::new(&config.commander, &config.task, config.run.seed),
         args: args.clone(),
-        threads: args.threads.unwrap_or_else(settings::cores),
+        threads: args.threads.unwrap_or_else(processors),
         config,
         out,
     };
@@ -141,7 +141,7 @@ impl Training {
         metrics.sync_all().context("metrics.jsonl")?;
         let weights = to_safetensors(&[("commander", &network.params)], "{\"format\":1}")?;
         let summary = json!({
-            "weights_sha256": sha256_hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
+            "weights_sha256": sha256::hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
             "batch": batch, "synthetic_instances": u64::from(imitation + ppo) * u64::from(batch),
             "cost_ratio": named(&measured), "untrained_cost_ratio": named(&untrained),
             "wall_s": clock.elapsed().as_secs_f64(),
@@ -221,12 +221,7 @@ impl Training {
 }
 
 fn named(ratios: &[f64]) -> Value {
-    VALIDATION_SIZES
-        .iter()
-        .zip(ratios)
-        .map(|(n, ratio)| (n.to_string(), json!(ratio)))
-        .collect::<serde_json::Map<_, _>>()
-        .into()
+    VALIDATION_SIZES.iter().zip(ratios).map(|(n, ratio)| (n.to_string(), *ratio)).collect()
 }
 
 fn list(ratios: &[f64]) -> String {

@@ -44,7 +44,6 @@ pub struct Running {
     log_start: u64,
     /// Address it listens on; empty if it does not listen.
     pub address: String,
-    /// Address of its HTTP page, if it has one.
     pub(crate) http: Option<String>,
 }
 
@@ -102,9 +101,7 @@ impl Service {
             Err(_) => Err(anyhow!("the {} was not ready within {} s", self.name, START.as_secs())),
         }
     }
-}
 
-impl Service {
     /// Starts it again after a wait. A start that fails (killed again, the port still in use) costs one of the lives.
     pub(crate) async fn restart(&self, lives: &mut u32, mut wait: impl FnMut() -> Duration) -> anyhow::Result<Running> {
         loop {
@@ -119,7 +116,6 @@ impl Service {
         }
     }
 
-    /// The error after the last restart.
     pub(crate) fn gave_up(&self, code: Option<u8>, reason: &str) -> anyhow::Error {
         let message = format!("the {} failed: {reason} (log: {})", self.name, self.log.display());
         coded(code.unwrap_or(exit::FAILURE), message)
@@ -127,7 +123,6 @@ impl Service {
 }
 
 impl Running {
-    /// Waits until it ends.
     pub(crate) async fn wait(&mut self) -> std::io::Result<ExitStatus> {
         self.child.wait().await
     }
@@ -145,7 +140,6 @@ impl Running {
         self.child.kill().await
     }
 
-    /// Sends SIGTERM.
     pub(crate) fn terminate(&self) {
         if let Some(pid) = self.child.id().and_then(|id| Pid::from_raw(id as i32)) {
             // It may have ended already.
@@ -197,7 +191,7 @@ pub(crate) async fn keep(service: Service, first: Running, stop: CancellationTok
         }
         lives -= 1;
         let (code, reason) = (code_of(status), running.failure(status));
-        if lives == 0 || code.is_some_and(|code| code == exit::USAGE || code == exit::UNAVAILABLE) {
+        if lives == 0 || matches!(code, Some(exit::USAGE | exit::UNAVAILABLE)) {
             return Err(service.gave_up(code, &reason));
         }
         tracing::warn!(service = service.name, reason, "the service died; restarting it");

@@ -157,6 +157,6 @@ fn a_folder_that_cannot_be_written_only_ends_the_writing() {
     std::fs::write(folder.path().join(FOLDER), "a file in the way").unwrap();
     let mut file = EventFile::new(folder.path(), None);
     file.append(LINE, 160);
-    assert!(matches!(file.state, State::Off));
+    assert!(matches!(file, EventFile::Off));
     file.append(LINE, 320);
 }

@@ -1,11 +1,10 @@
 //! The end of a lease: its result arrives, or the actor returns it without one.
 
-use super::{GrantedLease, Session, SessionEnd};
+use super::{Session, SessionEnd};
 use crate::run_events::describe;
-use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure, Verdict};
+use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure};
 use crate::serve::metrics::steps_of;
 use crate::serve::validate::validate;
-use crate::serve::work::OpenWork;
 use bytes::Bytes;
 use magex_core::error::FieldError;
 use magex_core::ids::ShardKind;
@@ -54,9 +53,8 @@ impl Session {
 
     pub(super) async fn on_part(&mut self, message: v1::ResultPart) -> Result<(), SessionEnd> {
         let lease = LeaseId(message.lease_id);
-        let Some(part) = message.part else {
-            return Err(SessionEnd::Refused(status::invalid_argument("part", "missing")));
-        };
+        let missing = || SessionEnd::Refused(status::invalid_argument("part", "missing"));
+        let part = message.part.ok_or_else(missing)?;
         self.shared.metrics.received_bytes.inc_by(part.data.len() as u64);
         if part.index == 0 {
             self.assembling = Some(lease);
@@ -77,7 +75,6 @@ impl Session {
         }
     }
 
-    /// Validates a whole result and sends the verdict to the actor.
     async fn on_result(
         &mut self,
         lease: LeaseId,
@@ -91,46 +88,40 @@ impl Session {
         );
         let result = match self.validate(bytes).instrument(span.clone()).await {
             Ok(result) => result,
-            Err(error) => return self.reject_lease(lease, error).await,
+            Err(error) => {
+                self.shared.work.with_ledger(|ledger| ledger.reject(self.id, lease));
+                return self.reject(lease, error).await;
+            }
         };
-        let shard = *result.shard();
-        let training = shard.kind == ShardKind::Train;
-        match self.shared.work.update(|open| self.complete(open, lease, result, granted, training, timing)) {
-            Verdict::Accepted => {
-                self.failed = 0;
-                self.shared.roster.mark_shard_done(self.id, shard.version);
-                self.acknowledge(lease, v1::Verdict::Accepted, String::new()).await
+        let (shard, steps) = (*result.shard(), steps_of(&result));
+        // The ledger and the timing change under one lock, because the last result of a plan wakes the training thread, which
+        // reads both.
+        let verdict = self.shared.work.update(|open| {
+            let verdict = open.ledger.complete(self.id, lease, result);
+            if verdict == Ok(v1::Verdict::Accepted) {
+                let now = Instant::now();
+                // The grant of a lease of an earlier session is unknown, and so is its duration.
+                let since_grant = granted.as_ref().map_or(Duration::ZERO, |granted| now - granted.since);
+                let reported = timing.filter(|_| granted.is_some());
+                open.timing.result_accepted(shard.kind == ShardKind::Train, since_grant, reported, now);
+                self.shared.metrics.accepted(steps);
             }
-            Verdict::Duplicate => {
-                self.failed = 0;
-                tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
-                self.acknowledge(lease, v1::Verdict::Duplicate, String::new()).await
-            }
-            Verdict::Rejected(error) => self.reject(lease, error).await,
+            verdict
+        });
+        let verdict = match verdict {
+            Ok(verdict) => verdict,
+            Err(error) => return self.reject(lease, error).await,
+        };
+        self.failed = 0;
+        if verdict == v1::Verdict::Accepted {
+            self.shared.roster.update(self.id, |actor| {
+                actor.status.shards_done += 1;
+                actor.status.weights_version = Some(shard.version.0);
+            });
+        } else {
+            tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
         }
-    }
-
-    /// Completes the lease in the ledger and in the timing: under one lock, because the last result of a plan wakes the
-    /// training thread, which reads both.
-    fn complete(
-        &self,
-        open: &mut OpenWork,
-        lease: LeaseId,
-        result: ShardResult,
-        granted: Option<GrantedLease>,
-        training: bool,
-        timing: Option<v1::ShardTiming>,
-    ) -> Verdict {
-        let steps = steps_of(&result);
-        let verdict = open.ledger.complete(self.id, lease, result);
-        if verdict == Verdict::Accepted {
-            let now = Instant::now();
-            // The grant of a lease of an earlier session is unknown, and so is its duration.
-            let since_grant = granted.as_ref().map_or(Duration::ZERO, |granted| now - granted.since);
-            open.timing.result_accepted(training, since_grant, timing.filter(|_| granted.is_some()), now);
-            self.shared.metrics.accepted(steps);
-        }
-        verdict
+        self.acknowledge(lease, verdict, String::new()).await
     }
 
     async fn validate(&self, bytes: Bytes) -> Result<ShardResult, FieldError> {
@@ -143,8 +134,7 @@ impl Session {
             let stopping = || FieldError::new("result", "the learner is shutting down");
             let _permit = self.shared.decoders.acquire().await.map_err(|_| stopping())?;
             tokio::task::spawn_blocking(check).await.map_err(|_| stopping())?
-        }
-        .map_err(|error| FieldError::new(error.field, error.problem))?;
+        }?;
         let version = delivery.result.shard().version;
         match self.shared.board.sha256(version) {
             Some(own) if own != delivery.weights_sha256 => {
@@ -154,11 +144,6 @@ impl Session {
             }
             _ => Ok(delivery.result),
         }
-    }
-
-    async fn reject_lease(&mut self, lease: LeaseId, error: FieldError) -> Result<(), SessionEnd> {
-        self.shared.work.with_ledger(|ledger| ledger.reject(self.id, lease));
-        self.reject(lease, error).await
     }
 
     /// A result did not arrive as it was sent. The connection is at fault, not the actor, so the actor may reconnect.

@@ -34,7 +34,7 @@ fn session_of(
     let protocol_version = PROTOCOL_VERSION;
     let hello = v1::Hello { protocol_version, actor_id: name.into(), process_id, ..Default::default() };
     let first = v1::RolloutRequest { message: Some(Request::Hello(hello)) };
-    let (id, hello) = handshake::handshake(shared, "here".into(), first, &outbound).unwrap();
+    let (id, hello) = handshake(shared, "here".into(), first, &outbound).unwrap();
     (Session::new(shared.clone(), id, hello, outbound), heard)
 }
 
