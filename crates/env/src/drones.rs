@@ -5,7 +5,7 @@
 //! angular velocities are in the world frame. Motors 0..3 are front right, rear right, rear left, front left.
 //!
 //! The authors' own environment for this task is not published: its physics is (the simulator's), spawn, success radius,
-//! reward and the handling of crashes are this crate's, see [`Drones`].
+//! reward and the handling of crashes are this crate's, see [`Flight`].
 
 mod constants;
 pub mod control;
@@ -16,20 +16,19 @@ pub mod world;
 mod engine;
 mod episode;
 
-use crate::error::EnvError;
 use crate::particles::placement::uniform;
-use crate::shell::{Moment, Rules, Shell, Starts, Task};
+use crate::rules::{Rules, Score, Starts};
 use episode::Episode;
+use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::statics::LANDMARKS;
 use magex_core::task::{DroneConfig, TaskConfig};
-use magex_core::trajectory::EpisodeMetrics;
 use model::{Craft, Effects};
-use world::Laws;
+use world::{Drone, Laws};
 
 pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 
-/// B episodes of N drones and N landmarks, stepped together.
+/// The rules of B episodes of N drones and N landmarks.
 ///
 /// Positions, velocities and landmarks are `[B, N, 3]` in m and m/s, goals `[B, N]`, actions `[B, N, 3]`, rewards
 /// `[B, N]`; agent_state `[B, N, 6]` are the target velocity, x and y of the body's up axis, and 1 for a drone that is out.
@@ -55,56 +54,50 @@ pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 /// than the thrust that makes it.
 ///
 /// Positions that are given with velocities of more than 2 m/s do not keep them: they are the first target velocities.
-pub type Drones = Shell<DroneTask>;
+pub struct Flight {
+    pub(crate) laws: Laws,
+    config: DroneConfig,
+    agents: usize,
+    /// Physics steps per command.
+    hold: u32,
+    pub(crate) episodes: Vec<Episode>,
+    /// `[B, N, 3]`
+    landmarks: Vec<f32>,
+}
 
-/// The drone task as the [`Shell`] sees it.
-#[derive(Debug)]
-pub enum DroneTask {}
+/// Draws the start of one episode.
+pub(crate) fn start(task: &TaskConfig, stream: &mut Stream, starts: &mut Starts) -> Result<(), FieldError> {
+    let spacing = f64::from(task.drones()?.spacing);
+    let mut draw = || -> Vec<f32> {
+        let flat = uniform(task.agents, task.side, spacing, stream);
+        flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]).collect()
+    };
+    starts.positions.extend(draw());
+    starts.extend(LANDMARKS, &draw());
+    Ok(())
+}
 
-impl Task for DroneTask {
-    type Rules = Flight;
-
-    fn start(task: &TaskConfig, _: bool, stream: &mut Stream, starts: &mut Starts) -> Result<(), EnvError> {
-        let spacing = f64::from(task.drones()?.spacing);
-        let mut draw = || -> Vec<f32> {
-            let flat = uniform(task.agents, task.side, spacing, stream);
-            flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]).collect()
-        };
-        starts.positions.extend(draw());
-        starts.extend(LANDMARKS, &draw());
-        Ok(())
-    }
-
-    fn rules(task: &TaskConfig, starts: &Starts) -> Result<Box<Flight>, EnvError> {
+impl Flight {
+    /// The rules of episodes that start there.
+    pub(crate) fn new(task: &TaskConfig, starts: &Starts) -> Result<Self, FieldError> {
         let (n, config) = (3 * task.agents, *task.drones()?);
-        let landmarks = starts.statics.get(LANDMARKS);
         let effects = Effects { ground: true, drag: true, downwash: true };
         let dt = 1.0 / f64::from(config.physics_hz);
         let states = starts.positions.chunks_exact(n).zip(starts.velocities.chunks_exact(n));
-        Ok(Box::new(Flight {
+        Ok(Self {
             laws: Laws::new(Craft::CF2X, effects, config.downwash, dt),
             config,
             agents: task.agents,
             hold: config.physics_hz / DroneConfig::COMMANDS_HZ,
             episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities)).collect(),
-            landmarks: landmarks.to_vec(),
-        }))
+            landmarks: starts.landmarks().to_vec(),
+        })
     }
-}
 
-/// The rules of the drone task.
-pub struct Flight {
-    laws: Laws,
-    config: DroneConfig,
-    agents: usize,
-    /// Physics steps per command.
-    hold: u32,
-    episodes: Vec<Episode>,
-    /// `[B, N, 3]`
-    landmarks: Vec<f32>,
-}
+    fn drones(&self) -> impl Iterator<Item = &Drone> {
+        self.episodes.iter().flat_map(|episode| &episode.world.drones)
+    }
 
-impl Flight {
     /// Landmarks [N, 3] of an episode.
     fn landmarks(&self, episode: usize) -> &[f32] {
         &self.landmarks[3 * self.agents * episode..3 * self.agents * (episode + 1)]
@@ -125,15 +118,13 @@ impl Rules for Flight {
     }
 
     fn write_positions(&self, out: &mut [f32]) {
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+        for (out, drone) in out.chunks_exact_mut(3).zip(self.drones()) {
             out.copy_from_slice(&drone.motion.pose.translation.to_array());
         }
     }
 
     fn write_velocities(&self, out: &mut [f32]) {
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+        for (out, drone) in out.chunks_exact_mut(3).zip(self.drones()) {
             out.copy_from_slice(&drone.motion.linvel.to_array());
         }
     }
@@ -145,12 +136,12 @@ impl Rules for Flight {
         }
     }
 
-    fn success(&self, episode: usize) -> f32 {
-        self.episodes[episode].success(self.landmarks(episode))
+    fn covered(&self, episode: usize) -> usize {
+        self.episodes[episode].covered(self.landmarks(episode))
     }
 
-    fn score(&self, episode: usize, moment: &Moment<'_>) -> EpisodeMetrics {
-        self.episodes[episode].score(moment, self.landmarks(episode))
+    fn score(&self, episode: usize, commands: f64, _: &[u32]) -> Score {
+        self.episodes[episode].score(commands, self.landmarks(episode))
     }
 }
 

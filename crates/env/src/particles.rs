@@ -1,6 +1,7 @@
 //! The particle engine that Simple Spread and Push Ball share: physics, contacts, arrivals, and where episodes start.
 
 pub(crate) mod arrival;
+pub(crate) mod batch;
 pub(crate) mod cells;
 pub mod constants;
 pub mod curves;

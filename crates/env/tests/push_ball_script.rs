@@ -15,12 +15,12 @@ use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_env::controller::PushBallScript;
-use magex_env::{Controller as _, Env as _, PushBall};
+use magex_env::{Controller as _, new_env};
 
 fn play(task: &TaskConfig, episodes: u32) -> Vec<EpisodeMetrics> {
     let n = task.agents;
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
-    let mut env = PushBall::new(task, streams, false).unwrap();
+    let mut env = new_env(task, streams, false).unwrap();
     let statics = env.statics().clone();
     let landmarks = env.landmarks();
     let mut script = PushBallScript::new(n);
@@ -82,7 +82,7 @@ fn the_choice_depends_on_the_state_alone() {
     // Three states of two episodes in one call, or one by one: the same actions.
     let task = TaskConfig::of(TaskName::PushBall, 5, Spawn::Uniform);
     let streams = (0..2).map(|episode| Key::new(9, Purpose::EvalSpawn, &[2, episode]).stream());
-    let mut env = PushBall::new(&task, streams, false).unwrap();
+    let mut env = new_env(&task, streams, false).unwrap();
     let goals: Vec<u32> = (0..2).flat_map(|_| (0..5).flat_map(|i| [i, 4 - i])).collect();
     env.set_goals(&goals).unwrap();
     let statics = env.statics().clone();

@@ -74,7 +74,7 @@ pub(crate) fn stream(k: u32) -> Stream {
     Key::new(7, Purpose::Spawn, &[k]).stream()
 }
 
-pub(crate) fn positions(env: &dyn Env, task: &TaskConfig) -> Vec<f32> {
+pub(crate) fn positions(env: &Env, task: &TaskConfig) -> Vec<f32> {
     let mut out = vec![0.0; env.episodes() * (task.agents + task.balls()) * task.dims()];
     env.write_positions(&mut out).unwrap();
     out

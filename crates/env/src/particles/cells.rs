@@ -49,7 +49,7 @@ impl<R: Real> Cells<R> {
     /// Column (or row) of a coordinate.
     #[inline(always)]
     fn column(&self, coordinate: R) -> usize {
-        let place = ((coordinate - self.low) * self.inverse_side).to_f64();
+        let place: f64 = ((coordinate - self.low) * self.inverse_side).into();
         (place as i32).clamp(0, self.columns as i32 - 1) as usize
     }
 

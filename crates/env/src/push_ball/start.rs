@@ -1,14 +1,16 @@
 //! Where the agents, balls and landmarks of an episode start.
 
-use super::constants::{PUSH_DISTANCE, SPACING};
+use super::constants::SPACING;
 use super::layouts::{layout, scale};
 use crate::particles::constants::CONTACT_DISTANCE;
 use crate::particles::curves::{Curve, LAYOUTS, Points};
 use crate::particles::placement::{lattice, near, scatter};
 use magex_core::error::FieldError;
 use magex_core::rng::Stream;
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{PushBallConfig, Spawn, TaskConfig};
 
+/// Agents start at least this far from balls.
+const PUSH_DISTANCE: f64 = PushBallConfig::PUSH_DISTANCE;
 /// Part of the way to a neighbour by which points on the lines are moved.
 const JITTER: f64 = 0.3;
 /// Tries after which a slot stays where it is, or an agent out of line.

@@ -111,7 +111,7 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
             let ([x, y], [vx, vy]) = (frame.positions[i], frame.velocities[i]);
             for (k, recorded) in [x, y, vx, vy].into_iter().enumerate() {
                 let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
-                let error = (self.state[k][i][w].to_f64() - recorded).abs() / scale;
+                let error = (Into::<f64>::into(self.state[k][i][w]) - recorded).abs() / scale;
                 worst[k / 2] = worse(worst[k / 2], error);
             }
         }
