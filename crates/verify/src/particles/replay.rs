@@ -1,12 +1,17 @@
 //! Runs a recording's bodies through the kernels of the rollouts and compares.
 
-use super::MpeReport;
 use super::recording::{Body, Frame, Recording, Scenario};
-use crate::check::worse;
+use crate::report::{Report, worse};
 use magex_core::task::PushBallConfig;
 use magex_env::particles::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
 use magex_env::{CONTACT_DISTANCE, Real};
 
+/// Largest one-step, reward and success difference of an agreeing f64 simulator.
+const ONE_STEP: f64 = 1e-12;
+/// Free runs are compared while a perturbation of 1e-12 has grown to no more than this.
+const WELL_CONDITIONED: f64 = 1e-9;
+/// Largest difference of a free run.
+const FREE_RUN: f64 = 1e-7;
 /// Worlds side by side: the recorded states of as many steps.
 const LANES: usize = 8;
 
@@ -111,74 +116,58 @@ impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
             let ([x, y], [vx, vy]) = (frame.positions[i], frame.velocities[i]);
             for (k, recorded) in [x, y, vx, vy].into_iter().enumerate() {
                 let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
-                let error = (Into::<f64>::into(self.state[k][i][w]) - recorded).abs() / scale;
-                worst[k / 2] = worse(worst[k / 2], error);
+                let ours: f64 = self.state[k][i][w].into();
+                worst[k / 2] = worse(worst[k / 2], (ours - recorded).abs() / scale);
             }
         }
         worst
     }
 }
 
-/// One step from every recorded state in f64 and in f32, and the free run: steps and worst position.
-type Errors = ([f64; 2], [f64; 2], (usize, f64));
-
-/// Measures everything in a [`MpeReport`].
-pub(super) fn verify(recording: &Recording) -> MpeReport {
+/// Compares the kernels and the authors' formulas with a recording.
+pub(super) fn verify(recording: &Recording) -> Report {
     let (double, single) = (physics::<f64>(recording), physics::<f32>(recording));
+    let (n, agent, ball) = (recording.agents, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS);
     // Standard bodies go through the very code of the rollouts, which knows their kinds.
-    let body = |size| Body { size, mass: 1.0, movable: true, collide: true };
-    let (agents, balls) = recording.bodies.split_at(recording.agents);
-    let standard = agents.iter().all(|&agent| agent == body(PushBallConfig::AGENT_RADIUS))
-        && balls.iter().all(|&ball| ball == body(PushBallConfig::BALL_RADIUS));
-    let errors = if !standard {
+    let standard = |bodies: &[Body], size| bodies.iter().all(|&body| body == Body::standard(size));
+    let (agents, balls) = recording.bodies.split_at(n);
+    let mut report = if !(standard(agents, agent) && standard(balls, ball)) {
         let bodies = &recording.bodies;
-        replay(
-            recording,
-            Mixed { bodies: bodies.clone(), physics: double },
-            Mixed { bodies: bodies.clone(), physics: single },
-        )
+        let mixed = Mixed { bodies: bodies.clone(), physics: double };
+        replay(recording, mixed, Mixed { bodies: bodies.clone(), physics: single })
     } else if balls.is_empty() {
         replay(recording, Alike(Pair::equal(&double, CONTACT_DISTANCE)), Alike(Pair::equal(&single, CONTACT_DISTANCE)))
     } else {
-        let n = recording.agents;
-        replay(
-            recording,
-            AgentsAndBalls::new(&double, n, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS),
-            AgentsAndBalls::new(&single, n, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS),
-        )
+        let kinds = AgentsAndBalls::new(&double, n, agent, ball);
+        replay(recording, kinds, AgentsAndBalls::new(&single, n, agent, ball))
     };
-    let (one_step, one_step_f32, free_run) = errors;
-    let mut report = MpeReport {
-        name: recording.name.clone(),
-        agents: recording.agents,
-        steps: recording.actions.len(),
-        one_step_position: one_step[0],
-        one_step_velocity: one_step[1],
-        one_step_position_f32: one_step_f32[0],
-        one_step_velocity_f32: one_step_f32[1],
-        free_run_steps: free_run.0,
-        free_run_position: free_run.1,
-        reward: 0.0,
-        success_rate: 0.0,
-        overlap_mismatches: 0,
-    };
+    let (mut rewards, mut successes, mut other_overlaps) = (0.0, 0.0, 0);
     for frame in &recording.frames {
         for (i, &reward) in frame.rewards.iter().enumerate() {
-            report.reward = worse(report.reward, (authors_reward(recording, frame, i) - reward).abs());
+            rewards = worse(rewards, (authors_reward(recording, frame, i) - reward).abs());
         }
-        let success = authors_success(recording, frame);
-        report.success_rate = worse(report.success_rate, (success - frame.success_rate).abs());
-        report.overlap_mismatches += usize::from(overlaps(recording, frame) != frame.overlaps);
+        successes = worse(successes, (authors_success(recording, frame) - frame.success_rate).abs());
+        other_overlaps += u32::from(overlaps(recording, frame) != frame.overlaps);
     }
+    report.limited("reward", rewards, ONE_STEP);
+    report.limited("success", successes, ONE_STEP);
+    report.limited("steps with other overlaps", other_overlaps.into(), 0.0);
     report
 }
 
-fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double: A, single: B) -> Errors {
-    (
-        one_step(World::new(recording, physics(recording), double.clone()), false),
-        one_step(World::new(recording, physics(recording), single), true),
-        free_run(World::new(recording, physics(recording), double)),
-    )
+/// One step from every recorded state, and the free run from the first one.
+fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double: A, single: B) -> Report {
+    let one_step_f32 = one_step(World::new(recording, physics(recording), single), true);
+    let one_step = one_step(World::new(recording, physics(recording), double.clone()), false);
+    let (free, free_run) = free_run(World::new(recording, physics(recording), double));
+    let (agents, steps) = (recording.agents, recording.actions.len());
+    let mut report =
+        Report { content: format!("N = {agents}, {steps} steps, {free} of them free"), ..Report::default() };
+    report.limited("one step", one_step, ONE_STEP);
+    // There is no bound that holds for every recording.
+    report.informative("one step in f32", one_step_f32, "contacts multiply the rounding of a position by their stiffness");
+    report.limited("free run", free_run, FREE_RUN);
+    report
 }
 
 fn physics<R: Real>(recording: &Recording) -> Physics<R> {
@@ -191,11 +180,11 @@ fn physics<R: Real>(recording: &Recording) -> Physics<R> {
     )
 }
 
-/// One step from every recorded state.
-fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: bool) -> [f64; 2] {
+/// The worst coordinate after one step from every recorded state.
+fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: bool) -> f64 {
     let recording = world.recording;
     let last = recording.actions.len().saturating_sub(1);
-    let mut worst = [0.0; 2];
+    let mut worst = 0.0;
     for first in (0..recording.actions.len()).step_by(LANES) {
         // Lanes beyond the last step repeat it.
         let steps: [usize; LANES] = std::array::from_fn(|w| (first + w).min(last));
@@ -204,8 +193,7 @@ fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: 
         }
         world.step(steps);
         for (w, &step) in steps.iter().enumerate() {
-            let error = world.error(w, &recording.frames[step + 1], relative);
-            worst = [worse(worst[0], error[0]), worse(worst[1], error[1])];
+            worst = world.error(w, &recording.frames[step + 1], relative).into_iter().fold(worst, worse);
         }
     }
     worst
@@ -214,15 +202,12 @@ fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: 
 /// Steps compared and the worst position on the way.
 fn free_run<B: Bodies<f64>>(mut world: World<'_, f64, 1, B>) -> (usize, f64) {
     let recording = world.recording;
-    let conditioned = |&&divergence: &&f64| divergence <= MpeReport::WELL_CONDITIONED;
-    let steps = recording.divergence.iter().take_while(conditioned).count();
-    let mut worst = 0.0;
+    let steps = recording.divergence.iter().take_while(|&&divergence| divergence <= WELL_CONDITIONED).count();
     world.load(0, &recording.frames[0]);
-    for step in 0..steps {
+    let worst = (0..steps).fold(0.0, |worst, step| {
         world.step([step]);
-        let [error, _] = world.error(0, &recording.frames[step + 1], false);
-        worst = worse(worst, error);
-    }
+        worse(worst, world.error(0, &recording.frames[step + 1], false)[0])
+    });
     (steps, worst)
 }
 
