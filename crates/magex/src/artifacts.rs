@@ -5,7 +5,7 @@ use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use magex_viewer::curve::{curve_svg, parse_metrics};
-use magex_viewer::replay::{ReplayEpisode, ReplayInfo, replay_html};
+use magex_viewer::replay::replay_html;
 use std::path::Path;
 
 /// Task, executor, scheduler and seed of a run on one line.
@@ -37,17 +37,7 @@ pub(crate) fn write_replay(
     config: &RunConfig,
     episodes: &[(Recording, Option<EpisodeMetrics>)],
 ) -> anyhow::Result<()> {
-    let info = ReplayInfo::of(&config.task, title, subtitle);
-    let named: Vec<ReplayEpisode<'_>> = episodes
-        .iter()
-        .enumerate()
-        .map(|(k, (recording, metrics))| ReplayEpisode {
-            name: format!("episode {}", k + 1),
-            recording,
-            metrics: *metrics,
-        })
-        .collect();
-    write(path, replay_html(&info, &named)?.as_bytes())
+    write(path, replay_html(&config.task, title, subtitle, episodes)?.as_bytes())
 }
 
 /// Writes `replay.html` from the recordings in the run folder.

@@ -1,26 +1,10 @@
 //! The learning curve of a run as an SVG picture: the episode metrics that have a plot, over joint steps.
 
+use magex_core::error::FieldError;
 use magex_core::metrics_table::{METRICS, Metric, Scale, Scope};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::fmt::Write as _;
-use thiserror::Error;
-
-/// Why a picture could not be drawn.
-#[derive(Debug, Error)]
-pub enum CurveError {
-    /// A line of the metrics file is malformed.
-    #[error("metrics.jsonl line {line}: {reason}")]
-    Line {
-        /// Counted from 1.
-        line: usize,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The file has no lines yet.
-    #[error("metrics.jsonl: no iterations yet; wait for the first one to finish")]
-    Empty,
-}
 
 /// One iteration of `metrics.jsonl`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -46,12 +30,12 @@ impl MetricsLine {
 ///
 /// # Errors
 /// A line that is not a JSON object with `iteration` and `joint_env_steps`; a file without lines.
-pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, CurveError> {
+pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, FieldError> {
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let mut lines: Vec<MetricsLine> = Vec::new();
     for (index, line) in whole.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
         let mut line: MetricsLine = serde_json::from_str(line)
-            .map_err(|error| CurveError::Line { line: index + 1, reason: error.to_string() })?;
+            .map_err(|error| FieldError::new(format!("metrics.jsonl line {}", index + 1), error.to_string()))?;
         // The last line of a run only evaluates, under the number of the iteration before it.
         if let Some(last) = lines.last().filter(|last| last.iteration == line.iteration) {
             for (key, value) in &last.values {
@@ -66,7 +50,11 @@ pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, CurveError> {
         }
         lines.push(line);
     }
-    if lines.is_empty() { Err(CurveError::Empty) } else { Ok(lines) }
+    if lines.is_empty() { Err(empty()) } else { Ok(lines) }
+}
+
+fn empty() -> FieldError {
+    FieldError::new("metrics.jsonl", "no iterations yet; wait for the first one to finish")
 }
 
 /// One diagram of the picture.
@@ -125,8 +113,8 @@ const GREEN: &str = "#1d9a62";
 ///
 /// # Errors
 /// No lines.
-pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, CurveError> {
-    let last = lines.last().ok_or(CurveError::Empty)?.joint_env_steps.max(1) as f64;
+pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, FieldError> {
+    let last = lines.last().ok_or_else(empty)?.joint_env_steps.max(1) as f64;
     let panels: Vec<Panel> = METRICS.iter().filter_map(|metric| Panel::of(metric, lines)).collect();
     let height = HEADER + FOOTER + panels.iter().map(|panel| TITLE + panel.height() + GAP).sum::<f64>();
     let mut svg = Svg(format!(
@@ -314,7 +302,7 @@ mod tests {
         assert_eq!(lines.len(), 2, "the resumed iterations replace the old ones");
         let [success, cost, reward] = ["success_rate", "cost_ratio", "reward"].map(|key| lines[0].get(key));
         assert_eq!((success, cost, reward), (Some(0.25), None, Some(-1.5)));
-        assert!(matches!(parse_metrics(""), Err(CurveError::Empty)));
+        assert_eq!(parse_metrics(""), Err(empty()));
         let error = parse_metrics(&format!("{LINE}\nnonsense\n")).unwrap_err().to_string();
         assert!(error.starts_with("metrics.jsonl line 2"), "{error}");
         let error = parse_metrics("{\"iteration\":3}\n").unwrap_err().to_string();
@@ -352,7 +340,7 @@ mod tests {
         assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("joint environment steps"));
         assert_eq!((svg.matches("<polyline").count(), svg.matches("<circle").count()), (8, 29));
         assert!(svg.contains("arrival, steps") && !svg.contains("second cost"), "no panel without the metric");
-        assert!(matches!(curve_svg("run", "", &[]), Err(CurveError::Empty)));
+        assert_eq!(curve_svg("run", "", &[]), Err(empty()));
     }
 
     #[test]

@@ -17,6 +17,7 @@ use magex_proto::v1;
 use magex_proto::weights::Weights;
 use magex_runtime::sync::lock;
 use points::Points;
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::io::BufRead as _;
 use std::path::Path;
@@ -36,7 +37,8 @@ const FAREWELL: Duration = Duration::from_secs(2);
 const QUIET: Duration = Duration::from_millis(500);
 
 /// What the training thread is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Phase {
     /// Training has not begun.
     Starting,
@@ -187,7 +189,7 @@ impl LivePage {
         let Some((outcome, recording)) = outcomes.iter().find_map(|o| Some((o, o.recording.as_ref()?))) else { return };
         let version = outcome.shard.version.0;
         let name = format!("version {version}, episode {}", outcome.shard.first_episode + 1);
-        let packed = match self.scene.pack(&name, recording, outcome.metrics.first()) {
+        let packed = match self.scene.pack(name, recording, outcome.metrics.first()) {
             Ok(packed) => packed,
             Err(error) => {
                 tracing::warn!(%error, "an evaluation episode cannot be drawn");
@@ -284,9 +286,9 @@ impl LivePage {
         let episode = lock(&self.episode).as_ref().map(|episode| episode.tag.clone());
         let run = lock(&self.run);
         let (state, reason) = match (&run.end, &status) {
-            (Some((state, reason)), _) => (*state, reason.clone()),
-            (None, Some(status)) => (state_name(status.state()), None),
-            (None, None) => (phase_name(run.phase), None),
+            (Some((state, reason)), _) => (json!(state), reason.clone()),
+            (None, Some(status)) => (json!(state_name(status.state())), None),
+            (None, None) => (json!(run.phase), None),
         };
         let mut value = json!({
             "process": self.process, "revision": revision, "run_id": run.run_id, "name": self.info.name,
@@ -323,23 +325,10 @@ fn describe_ledger(ledger: &v1::LedgerStatus) -> Value {
     })
 }
 
-fn state_name(state: v1::RunState) -> &'static str {
+/// The name of a state: `RUN_STATE_TRAINING` is `training`.
+fn state_name(state: v1::RunState) -> String {
     match state {
-        v1::RunState::Unspecified => "starting",
-        v1::RunState::WaitingForActors => "waiting_for_actors",
-        v1::RunState::Collecting => "collecting",
-        v1::RunState::Training => "training",
-        v1::RunState::Evaluating => "evaluating",
-        v1::RunState::Finished => "finished",
-        v1::RunState::Draining => "draining",
-    }
-}
-
-fn phase_name(phase: Phase) -> &'static str {
-    match phase {
-        Phase::Starting => "starting",
-        Phase::Collecting => "collecting",
-        Phase::Evaluating => "evaluating",
-        Phase::Training => "training",
+        v1::RunState::Unspecified => "starting".to_owned(),
+        state => state.as_str_name().trim_start_matches("RUN_STATE_").to_lowercase(),
     }
 }

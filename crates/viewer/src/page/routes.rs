@@ -1,7 +1,7 @@
 //! The page over HTTP: `/`, and the JSON that its script asks for.
 
 use super::{LivePage, points};
-use crate::scene::{SCRIPT, base64};
+use crate::scene::SCRIPT;
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::RawQuery;
@@ -13,6 +13,8 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::middleware::map_response;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use magex_proto::v1;
 use sha2::{Digest as _, Sha256};
 use std::future::Future;
@@ -79,7 +81,7 @@ fn policy(html: &[u8]) -> HeaderValue {
     let hash = |tag: &str| {
         let (open, close) = (format!("<{tag}>"), format!("</{tag}>"));
         let inside = html.split_once(&open).and_then(|(_, rest)| rest.split_once(&close)).map_or("", |(text, _)| text);
-        format!("'sha256-{}'", base64(&Sha256::digest(inside)))
+        format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(inside)))
     };
     let text = format!(
         "default-src 'none'; script-src {}; style-src {}; connect-src 'self'; img-src data:; base-uri 'none'; \
