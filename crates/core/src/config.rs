@@ -7,26 +7,19 @@ mod raw;
 
 use crate::error::{FieldError, UnknownName, check_range};
 use crate::task::{Spawn, TaskConfig};
-use raw::RawRunConfig;
+use serde::de::IntoDeserializer as _;
 use serde::{Deserialize, Serialize};
 
-pub use raw::RENAMED;
-
-/// Why a configuration was refused.
+/// Why a configuration was refused: it is not TOML, or has a key that does not exist, or a value of the wrong type or out of
+/// its range.
 #[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// Not TOML.
-    #[error("configuration: {0}")]
-    Syntax(String),
-    /// A key that does not exist, or a value of the wrong type or out of its range.
-    #[error("configuration: {0}")]
-    Field(FieldError),
-}
+#[error("configuration: {0}")]
+pub struct ConfigError(pub String);
 
 // Not a source: the message holds all of it, and reports that follow the sources would say it twice.
 impl From<FieldError> for ConfigError {
     fn from(error: FieldError) -> Self {
-        Self::Field(error)
+        Self(error.to_string())
     }
 }
 
@@ -193,17 +186,9 @@ impl std::fmt::Display for CommanderPolicy {
 impl std::str::FromStr for CommanderPolicy {
     type Err = UnknownName;
     fn from_str(text: &str) -> Result<Self, UnknownName> {
-        match text {
-            "pairwise" => Ok(Self::Pairwise),
-            "ranking" => Ok(Self::Ranking),
-            "exact" => Ok(Self::Exact),
-            "random" => Ok(Self::Random),
-            _ => Err(UnknownName {
-                what: "scheduler",
-                name: text.to_owned(),
-                choices: "pairwise, ranking, exact or random",
-            }),
-        }
+        let choices = "pairwise, ranking, exact or random";
+        Self::deserialize(text.into_deserializer())
+            .map_err(|_: serde::de::value::Error| UnknownName { what: "scheduler", name: text.to_owned(), choices })
     }
 }
 
@@ -349,7 +334,7 @@ impl Default for RunConfig {
 impl RunConfig {
     /// Reads TOML; missing keys take their defaults; unknown keys and values out of range are errors.
     pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
-        RawRunConfig::from_toml(text)?.resolve()?.validated()
+        raw::read(text)?.validated()
     }
 
     /// The same configuration if every value is in its range.
@@ -360,7 +345,7 @@ impl RunConfig {
 
     /// The effective configuration, every key with its value.
     pub fn to_toml(&self) -> Result<String, ConfigError> {
-        toml::to_string(self).map_err(|e| ConfigError::Syntax(e.to_string()))
+        toml::to_string(self).map_err(|e| ConfigError(e.to_string()))
     }
 
     /// Episodes per iteration unless they are chosen: about 200 agents' worth, a multiple of the shards.

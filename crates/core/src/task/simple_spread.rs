@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 
 /// `[task.reward]`: coefficients of the reward (paper, eq. 5):
 /// r = bonus · 1[d ≤ 0.15] − distance · d / d_ref − collision · #{other agents closer than 0.2}.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct RewardConfig {
     /// α: paid on every step on which the agent is within 0.15 of its goal (metric distance).
     pub bonus: f32,
@@ -16,35 +17,13 @@ pub struct RewardConfig {
     pub distance: f32,
     /// γ: charged for every other agent closer than two radii.
     pub collision: f32,
-    /// d_ref in world units.
+    /// d_ref in world units. Default: the side of the map.
     pub distance_unit: f32,
 }
 
-/// `[task.reward]` as it is written: the unit of distance is the side of the map unless it is given.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct RawReward {
-    bonus: f32,
-    distance: f32,
-    collision: f32,
-    distance_unit: Option<f32>,
-}
-
-impl Default for RawReward {
+impl Default for RewardConfig {
     fn default() -> Self {
-        Self { bonus: 1.0, distance: 1.0, collision: 1.0, distance_unit: None }
-    }
-}
-
-impl RawReward {
-    fn settings(self, side: f32) -> TaskSettings {
-        let Self { bonus, distance, collision, distance_unit } = self;
-        TaskSettings::SimpleSpread(RewardConfig {
-            bonus,
-            distance,
-            collision,
-            distance_unit: distance_unit.unwrap_or(side),
-        })
+        Self { bonus: 1.0, distance: 1.0, collision: 1.0, distance_unit: 1.0 }
     }
 }
 
@@ -74,13 +53,16 @@ pub(super) const DEFINITION: Definition = Definition {
         _ => up_to_tens(20.0 + 10.0 * side),
     },
     layout_scale: |agents| if agents <= 20 { 1.5 } else { 2.0 },
-    default_settings: |side| RawReward::default().settings(side),
-    read_settings: |side, section| {
-        let raw: RawReward = toml_table::read("task.reward", section)?;
-        if raw.distance_unit == Some(0.0) {
+    default_settings: |side| {
+        TaskSettings::SimpleSpread(RewardConfig { distance_unit: side, ..RewardConfig::default() })
+    },
+    read_settings: |side, mut section| {
+        section.entry("distance_unit").or_insert_with(|| f64::from(side).into());
+        let reward: RewardConfig = toml_table::read("task.reward", section)?;
+        if reward.distance_unit == 0.0 {
             return Err(FieldError::new("task.reward.distance_unit", super::NOT_ZERO));
         }
-        Ok(raw.settings(side))
+        Ok(TaskSettings::SimpleSpread(reward))
     },
     validate,
 };

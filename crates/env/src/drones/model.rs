@@ -68,11 +68,6 @@ impl Craft {
         self.mass * self.gravity
     }
 
-    /// rpm of each motor at which the thrust is the weight: 14468.4 for [`Craft::CF2X`].
-    pub fn hover_rpm(&self) -> f64 {
-        libm::sqrt(self.weight() / (4.0 * self.kf))
-    }
-
     /// Thrust of every motor in N.
     #[inline]
     pub fn thrust(&self, rpm: [f64; 4]) -> [f64; 4] {
