@@ -187,8 +187,11 @@ impl std::str::FromStr for CommanderPolicy {
     type Err = UnknownName;
     fn from_str(text: &str) -> Result<Self, UnknownName> {
         let choices = "pairwise, ranking, exact or random";
-        Self::deserialize(text.into_deserializer())
-            .map_err(|_: serde::de::value::Error| UnknownName { what: "scheduler", name: text.to_owned(), choices })
+        Self::deserialize(text.into_deserializer()).map_err(|_: serde::de::value::Error| UnknownName {
+            what: "scheduler",
+            name: text.to_owned(),
+            choices,
+        })
     }
 }
 

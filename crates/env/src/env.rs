@@ -118,7 +118,10 @@ impl<R: Rules + ?Sized> Env<R> {
         }
         let horizon = self.shape.steps;
         if self.steps as usize >= horizon {
-            return Err(FieldError::new("step", format!("the episode is over after {horizon} steps; start a new batch")));
+            return Err(FieldError::new(
+                "step",
+                format!("the episode is over after {horizon} steps; start a new batch"),
+            ));
         }
         self.check_actions(actions)?;
         self.steps += 1;

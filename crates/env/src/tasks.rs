@@ -10,11 +10,7 @@ use magex_core::task::{TaskConfig, TaskName};
 
 /// Episodes of a task, one per stream, started as the task says. In training, starts that help learning may be mixed in. An
 /// error if the task does not validate.
-pub fn new_env(
-    task: &TaskConfig,
-    streams: impl Iterator<Item = Stream>,
-    training: bool,
-) -> Result<Env, FieldError> {
+pub fn new_env(task: &TaskConfig, streams: impl Iterator<Item = Stream>, training: bool) -> Result<Env, FieldError> {
     assemble(task, starts(task, streams, training)?)
 }
 

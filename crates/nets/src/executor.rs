@@ -21,9 +21,9 @@ use crate::ops::{Activation, GraphNoise, linear, neighbour_pool};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
+use local::LocalNet;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
-use local::LocalNet;
 use std::sync::Arc;
 use team::TeamNet;
 

@@ -110,7 +110,8 @@ impl FeatureSpec {
                 v: &states.velocities[s * joint..(s + 1) * joint],
                 agent_state: &states.agent_state[s * n * self.shape.agent_state..(s + 1) * n * self.shape.agent_state],
                 landmarks: &landmarks[episode * self.shape.landmarks * d..(episode + 1) * self.shape.landmarks * d],
-                goals: &states.goals[episode * n * self.shape.goals_per_agent..(episode + 1) * n * self.shape.goals_per_agent],
+                goals: &states.goals
+                    [episode * n * self.shape.goals_per_agent..(episode + 1) * n * self.shape.goals_per_agent],
                 dims: d,
                 agents: n,
                 goals_per_agent: self.shape.goals_per_agent,

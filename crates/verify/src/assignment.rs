@@ -84,7 +84,9 @@ impl Case {
         let (rows, cols) = (case.get("rows")?.count(MOST)?, case.get("cols")?.count(MOST)?);
         let cost = match (case.optional("matrix")?, case.optional("agents")?, case.optional("goals")?) {
             (Some(matrix), None, None) => matrix.each(rows * cols, Field::number)?,
-            (None, Some(agents), Some(goals)) => euclidean(&agents.each(rows, Field::array)?, &goals.each(cols, Field::array)?),
+            (None, Some(agents), Some(goals)) => {
+                euclidean(&agents.each(rows, Field::array)?, &goals.each(cols, Field::array)?)
+            }
             _ => {
                 let field = format!("{}.matrix", case.path());
                 return Err(FieldError::new(field, "either matrix or both agents and goals are needed"));

@@ -217,7 +217,8 @@ impl fmt::Display for VerifyReport {
         let (agreeing, failing, skipped) = (self.agreeing(), self.failing(), self.skipped());
         write!(f, "{agreeing} agree, {failing} fail, {skipped} skipped")?;
         if agreeing + failing == 0 {
-            let known = [particles::FORMAT, assignment::FORMAT, drones::FLIGHT, drones::CALLS, drones::FORCES].join(", ");
+            let known =
+                [particles::FORMAT, assignment::FORMAT, drones::FLIGHT, drones::CALLS, drones::FORCES].join(", ");
             write!(f, "; FAIL: no recording of a supported format ({known})")?;
         }
         Ok(())

@@ -6,8 +6,8 @@
 
 use crate::controller::interface::{Controller, check};
 use crate::particles::physics::{Bodies, Forces, Motion, Pair, Physics, pack};
-use crate::push_ball::law::angle;
 use crate::push_ball::REACHED;
+use crate::push_ball::law::angle;
 use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;
 use magex_core::task::{PushBallConfig, Spawn, TaskConfig, TaskName};

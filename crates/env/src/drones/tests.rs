@@ -39,7 +39,12 @@ fn new_env(task: &TaskConfig, streams: impl Iterator<Item = Stream>) -> Result<D
     assemble(task, starts(task, streams, false)?)
 }
 
-fn from_state(task: &TaskConfig, positions: &[f32], velocities: &[f32], landmarks: &[f32]) -> Result<Drones, FieldError> {
+fn from_state(
+    task: &TaskConfig,
+    positions: &[f32],
+    velocities: &[f32],
+    landmarks: &[f32],
+) -> Result<Drones, FieldError> {
     assemble(task, Starts::given(task, [positions, velocities, landmarks])?)
 }
 
@@ -311,8 +316,7 @@ fn mistakes_are_named() {
     assert!(text(drones.step(&[1; 6], &mut [0.0; 3])).contains("rewards: 3"));
     assert!(text(drones.write_agent_state(&mut [0.0; 11])).contains("agent_state"));
     assert_eq!(drones.steps(), 0);
-    let refused =
-        |positions: &[f32]| from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
+    let refused = |positions: &[f32]| from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
     assert!(refused(&[0.0; 5]).contains("positions"));
     assert!(refused(&[0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0]).contains("positions[2]"));
     for (hz, word) in [(100, "multiple"), (90, "chatters"), (30, "chatters"), (1950, "1920")] {

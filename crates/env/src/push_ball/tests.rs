@@ -298,7 +298,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     let mut env = new_env(&task, streams(2), false).unwrap();
     let before = env.positions();
     let mut rewards = [0.0; 10];
-    assert_eq!(env.step(&[0; 10], &mut rewards), Err(FieldError::new("goals", "not set; call set_goals before the first step")));
+    assert_eq!(
+        env.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("goals", "not set; call set_goals before the first step"))
+    );
     assert_eq!(env.set_goals(&[0; 10]), Err(FieldError::new("goals", "10 entries, the shape asks for 20")));
     let mut goals = own(2, 5);
     goals[6] = 5;
@@ -310,7 +313,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     env.set_goals(&goals).unwrap();
     let mut actions = [1; 10];
     actions[3] = 5;
-    assert_eq!(env.step(&actions, &mut rewards), Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y")));
+    assert_eq!(
+        env.step(&actions, &mut rewards),
+        Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y"))
+    );
     assert!(env.step(&[0; 9], &mut rewards).is_err());
     assert!(env.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(env.write_positions(&mut [0.0; 20]).is_err() && env.write_velocities(&mut [0.0; 41]).is_err());
@@ -319,7 +325,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     for _ in 0..task.horizon {
         env.step(&[0; 10], &mut rewards).unwrap();
     }
-    assert_eq!(env.step(&[0; 10], &mut rewards), Err(FieldError::new("step", "the episode is over after 100 steps; start a new batch")));
+    assert_eq!(
+        env.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("step", "the episode is over after 100 steps; start a new batch"))
+    );
     let mut positions = [0.0; 20];
     positions[19] = f32::NAN;
     let bad = env_from_state(&task, &positions, &[0.0; 20], &[0.0; 10]);
@@ -328,11 +337,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     let mut task = task;
     task.settings = TaskSettings::PushBall(PushBallConfig { start_in_line_fraction: 1.5, ..PushBallConfig::default() });
     assert!(
-        new_env(&task, streams(1), true)
-            .err()
-            .unwrap()
-            .to_string()
-            .contains("task.push_ball.start_in_line_fraction")
+        new_env(&task, streams(1), true).err().unwrap().to_string().contains("task.push_ball.start_in_line_fraction")
     );
 }
 

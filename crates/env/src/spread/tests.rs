@@ -182,7 +182,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     let mut spread = new_env(&task, streams(2), false).unwrap();
     let before = spread.positions();
     let mut rewards = [0.0; 10];
-    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(FieldError::new("goals", "not set; call set_goals before the first step")));
+    assert_eq!(
+        spread.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("goals", "not set; call set_goals before the first step"))
+    );
     assert_eq!(spread.set_goals(&[0; 9]), Err(FieldError::new("goals", "9 entries, the shape asks for 10")));
     let mut goals = [4; 10];
     goals[7] = 5;
@@ -190,7 +193,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     spread.set_goals(&[0; 10]).unwrap();
     let mut actions = [1; 10];
     actions[3] = 5;
-    assert_eq!(spread.step(&actions, &mut rewards), Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y")));
+    assert_eq!(
+        spread.step(&actions, &mut rewards),
+        Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y"))
+    );
     assert!(spread.step(&[0; 9], &mut rewards).is_err());
     assert!(spread.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(spread.write_positions(&mut [0.0; 19]).is_err());
@@ -198,7 +204,10 @@ fn wrong_calls_are_named_and_change_nothing() {
     for _ in 0..task.horizon {
         spread.step(&[0; 10], &mut rewards).unwrap();
     }
-    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(FieldError::new("step", "the episode is over after 60 steps; start a new batch")));
+    assert_eq!(
+        spread.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("step", "the episode is over after 60 steps; start a new batch"))
+    );
     let bad = env_from_state(&task, &[f32::NAN; 10], &[0.0; 10], &[0.0; 10]);
     assert_eq!(bad.err(), Some(FieldError::new("positions[0]", "NaN is not finite")));
     let mut task = task;

@@ -133,8 +133,7 @@ impl TeamNet {
         };
         let near = spec.neighbours > 0;
         let fused = 2 * f + if near { f / 2 } else { 0 };
-        let encounters =
-            if near { Some(NeighbourEncoder::build(params, "f_near", spec, f / 2)?) } else { None };
+        let encounters = if near { Some(NeighbourEncoder::build(params, "f_near", spec, f / 2)?) } else { None };
         Ok(Self {
             observe,
             team,

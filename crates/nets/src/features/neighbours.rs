@@ -18,7 +18,8 @@ impl FeatureSpec {
         let (d, k, reach) = (self.shape.dims, self.neighbours, self.observation.sensing_radius);
         let p = state.p;
         let width = self.neighbour_width();
-        let gone = |j: usize| j < self.shape.agents && self.observation.out.is_some_and(|flag| state.extra(j)[flag] > 0.0);
+        let gone =
+            |j: usize| j < self.shape.agents && self.observation.out.is_some_and(|flag| state.extra(j)[flag] > 0.0);
         // Bodies sorted along x: only those within reach of one another on this axis are looked at.
         let mut order: Vec<usize> = (0..self.shape.bodies).filter(|&j| !gone(j)).collect();
         order.sort_by(|&a, &b| p[a * d].total_cmp(&p[b * d]).then(a.cmp(&b)));

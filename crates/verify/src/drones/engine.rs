@@ -85,7 +85,8 @@ fn one_step(recording: &Trajectory, laws: &Laws, report: &mut Report) {
     if fastest > 0.0 {
         report.limited("rapier one step, fast turn over what it may miss", beyond, 1.0);
         let short = fastest.powi(3) / 12.0;
-        let words = format!("rapier linearises rotations: a turn of {fastest:.3} rad in a step is short by {short:.1e}");
+        let words =
+            format!("rapier linearises rotations: a turn of {fastest:.3} rad in a step is short by {short:.1e}");
         report.informative("rapier one step, fast turn", fast, words);
     }
 }

@@ -165,7 +165,11 @@ fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double:
         Report { content: format!("N = {agents}, {steps} steps, {free} of them free"), ..Report::default() };
     report.limited("one step", one_step, ONE_STEP);
     // There is no bound that holds for every recording.
-    report.informative("one step in f32", one_step_f32, "contacts multiply the rounding of a position by their stiffness");
+    report.informative(
+        "one step in f32",
+        one_step_f32,
+        "contacts multiply the rounding of a position by their stiffness",
+    );
     report.limited("free run", free_run, FREE_RUN);
     report
 }
