@@ -8,4 +8,4 @@ pub mod curves;
 pub mod physics;
 pub(crate) mod placement;
 pub mod real;
-pub(crate) mod swarm;
+pub mod swarm;

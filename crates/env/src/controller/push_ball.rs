@@ -84,9 +84,6 @@ impl Bodies<f32> for Kinds {
     fn pair(&self, i: usize, j: usize) -> Pair<f32> {
         self.pairs[usize::from(self.ball[i]) + usize::from(self.ball[j])]
     }
-    fn inverse_mass(&self, _: usize) -> f32 {
-        1.0
-    }
     /// The agent and its ball; what else is around goes on as it goes.
     fn movable(&self, i: usize) -> bool {
         i < 2

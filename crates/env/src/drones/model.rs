@@ -89,14 +89,10 @@ impl Craft {
         times(scale(self.drag, -turning), velocity)
     }
 
-    /// Extra thrust of every motor in N near the ground plane z = 0; `None` for a drone on its side or upside down.
+    /// Extra thrust of every motor in N near the ground plane z = 0, given position, attitude (also as a matrix) and thrust;
+    /// `None` for a drone on its side or upside down.
     #[inline]
-    pub fn ground_effect(&self, position: [f64; 3], attitude: [f64; 4], rpm: [f64; 4]) -> Option<[f64; 4]> {
-        self.ground_effect_of(position, attitude, &Mat3::of(attitude), self.thrust(rpm))
-    }
-
-    #[inline]
-    fn ground_effect_of(&self, p: V3, q: [f64; 4], r: &Mat3, thrust: [f64; 4]) -> Option<[f64; 4]> {
+    pub fn ground_effect(&self, p: V3, q: [f64; 4], r: &Mat3, thrust: [f64; 4]) -> Option<[f64; 4]> {
         // |roll| < π/2 is R_zz > 0; |pitch| < π/2 holds short of the poles.
         if sine_of_pitch(q).abs() >= POLE || r.0[2][2] <= 0.0 {
             return None;
@@ -191,7 +187,7 @@ impl Craft {
         let mut frame = &lagged;
         if effects.ground {
             frame = &now;
-            if let Some(extra) = self.ground_effect_of(state.position, state.attitude, &now, thrust) {
+            if let Some(extra) = self.ground_effect(state.position, state.attitude, &now, thrust) {
                 let up = now.axis(2);
                 force = add(force, scale(up, total(extra)));
                 moment = add(moment, cross(now.turn(self.lever(extra)), up));

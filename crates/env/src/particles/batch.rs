@@ -3,7 +3,7 @@
 
 use super::arrival::{Arrivals, View};
 use super::cells::Cells;
-use super::physics::Bodies;
+use super::physics::{Bodies, Physics};
 use super::swarm::Swarm;
 use crate::rules::{Rules, Score, Starts};
 use magex_core::error::FieldError;
@@ -14,11 +14,11 @@ pub(crate) trait Objective<const W: usize>: Sized + Send {
     /// Bodies of the task.
     type Bodies: Bodies<f32> + Send;
 
-    /// Places in a world's bodies of those that cover landmarks: from here to the last.
-    fn first_covering(agents: usize) -> usize;
+    /// Bodies per agent: agents come first, and the last N bodies cover landmarks.
+    const BODIES: usize;
 
-    /// The bodies of a world and their number.
-    fn bodies(agents: usize) -> (Self::Bodies, usize);
+    /// The bodies of a world.
+    fn bodies(agents: usize) -> Self::Bodies;
 
     /// Until goals are set they are at the origin.
     fn new(task: &TaskConfig, blocks: usize) -> Result<Self, FieldError>;
@@ -56,12 +56,12 @@ pub(crate) struct Batch<const W: usize, O: Objective<W>> {
 impl<const W: usize, O: Objective<W>> Batch<W, O> {
     /// Worlds that start there; with `cells` and W = 1, neighbours are found by cells.
     pub(crate) fn new(task: &TaskConfig, starts: &Starts, cells: bool) -> Result<Self, FieldError> {
-        let (agents, side, first) = (task.agents, f64::from(task.side), O::first_covering(task.agents));
-        let (kinds, bodies) = O::bodies(agents);
+        let (agents, side, kinds) = (task.agents, f64::from(task.side), O::bodies(task.agents));
         let reach = f64::from(kinds.reach2()).sqrt();
         let swarm = Swarm::new(
+            Physics::standard(),
             kinds,
-            (agents, bodies),
+            (agents, O::BODIES * agents),
             [&starts.positions, &starts.velocities, starts.landmarks()],
             cells.then_some(side),
         );
@@ -69,7 +69,7 @@ impl<const W: usize, O: Objective<W>> Batch<W, O> {
         let objective = O::new(task, blocks)?;
         Ok(Self {
             arrivals: Arrivals::new(swarm.worlds(), agents, objective.cover2(), starts.landmarks()),
-            cells: (first > 0 && swarm.cells.is_some()).then(|| Cells::new(bodies - first, side, reach)),
+            cells: (O::BODIES > 1 && swarm.cells.is_some()).then(|| Cells::new(agents, side, reach)),
             swarm,
             objective,
             reward_sum: vec![[0.0; W]; blocks],
@@ -102,7 +102,8 @@ impl<const W: usize, O: Objective<W>> Batch<W, O> {
 
     fn observe(&mut self, block: usize, step: u32, worlds: usize) {
         let (swarm, n) = (&self.swarm, self.rewards.len());
-        let bodies = swarm.block(block).start + O::first_covering(n)..swarm.block(block).end;
+        let end = swarm.block(block).end;
+        let bodies = end - n..end;
         let (x, y) = (&swarm.x[bodies.clone()], &swarm.y[bodies]);
         let cells = match &mut self.cells {
             Some(cells) => {

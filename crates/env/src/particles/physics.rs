@@ -73,13 +73,19 @@ impl<R: Real> Pair<R> {
 }
 
 /// The bodies of a world.
-pub trait Bodies<R> {
+pub trait Bodies<R: Real> {
     /// The pair (i, j), i < j.
     fn pair(&self, i: usize, j: usize) -> Pair<R>;
     /// 1 / mass.
-    fn inverse_mass(&self, i: usize) -> R;
+    #[inline(always)]
+    fn inverse_mass(&self, _i: usize) -> R {
+        R::ONE
+    }
     /// Whether the body moves at all.
-    fn movable(&self, i: usize) -> bool;
+    #[inline(always)]
+    fn movable(&self, _i: usize) -> bool {
+        true
+    }
     /// The largest reach² of any pair.
     fn reach2(&self) -> R;
 }
@@ -92,14 +98,6 @@ impl<R: Real> Bodies<R> for Alike<R> {
     #[inline(always)]
     fn pair(&self, _: usize, _: usize) -> Pair<R> {
         self.0
-    }
-    #[inline(always)]
-    fn inverse_mass(&self, _: usize) -> R {
-        R::ONE
-    }
-    #[inline(always)]
-    fn movable(&self, _: usize) -> bool {
-        true
     }
     #[inline(always)]
     fn reach2(&self) -> R {
@@ -129,14 +127,6 @@ impl<R: Real> Bodies<R> for AgentsAndBalls<R> {
     #[inline(always)]
     fn pair(&self, i: usize, j: usize) -> Pair<R> {
         self.pairs[usize::from(i >= self.agents) + usize::from(j >= self.agents)]
-    }
-    #[inline(always)]
-    fn inverse_mass(&self, _: usize) -> R {
-        R::ONE
-    }
-    #[inline(always)]
-    fn movable(&self, _: usize) -> bool {
-        true
     }
     #[inline(always)]
     fn reach2(&self) -> R {

@@ -9,7 +9,7 @@ use std::ops::Range;
 /// The worlds, E bodies each; the first N of them act. Array element `[block · E + i][w]` belongs to body i of world
 /// block · W + w; the lanes of the last block that have no world hold bodies far apart, at rest.
 #[derive(Debug, Clone)]
-pub(crate) struct Swarm<R, const W: usize, B> {
+pub struct Swarm<R, const W: usize, B> {
     worlds: usize,
     agents: usize,
     bodies: usize,
@@ -36,7 +36,8 @@ pub(crate) struct Swarm<R, const W: usize, B> {
 impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
     /// Worlds with the given positions and velocities `[B, E, 2]`, E = `bodies` of which `agents` act, and landmarks
     /// `[B, N, 2]`. A `cells_over` the side of the map, if given and W = 1, finds neighbours by cells.
-    pub(crate) fn new(
+    pub fn new(
+        physics: Physics<R>,
         kinds: B,
         (agents, bodies): (usize, usize),
         [positions, velocities, landmarks]: [&[R]; 3],
@@ -50,7 +51,7 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
             worlds,
             agents,
             bodies,
-            physics: Physics::standard(),
+            physics,
             x: (0..blocks * bodies).map(|k| [R::from_f64((k % bodies) as f64); W]).collect(),
             y: zero.clone(),
             vx: zero.clone(),
@@ -88,6 +89,11 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
         block * self.bodies..(block + 1) * self.bodies
     }
 
+    /// E.
+    pub fn bodies(&self) -> usize {
+        self.bodies
+    }
+
     pub(crate) fn worlds(&self) -> usize {
         self.worlds
     }
@@ -104,7 +110,7 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
     }
 
     /// One step of a block: moves its bodies, then looks for contacts. `actions` is `[worlds of the block, N]`.
-    pub(crate) fn step(&mut self, block: usize, actions: &[u8]) {
+    pub fn step(&mut self, block: usize, actions: &[u8]) {
         for (w, world) in actions.chunks_exact(self.agents).enumerate() {
             for (lanes, &action) in self.actions.iter_mut().zip(world) {
                 lanes[w] = action;
@@ -154,12 +160,12 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
     }
 
     /// Writes `[B, E, 2]`.
-    pub(crate) fn write_positions(&self, out: &mut [R]) {
+    pub fn write_positions(&self, out: &mut [R]) {
         self.interleave(&self.x, &self.y, out);
     }
 
     /// Writes `[B, E, 2]`.
-    pub(crate) fn write_velocities(&self, out: &mut [R]) {
+    pub fn write_velocities(&self, out: &mut [R]) {
         self.interleave(&self.vx, &self.vy, out);
     }
 

@@ -27,13 +27,10 @@ pub(super) struct PushBallObjective<const W: usize> {
 impl<const W: usize> Objective<W> for PushBallObjective<W> {
     type Bodies = Bodies;
 
-    fn first_covering(agents: usize) -> usize {
-        agents
-    }
+    const BODIES: usize = 2;
 
-    fn bodies(agents: usize) -> (Bodies, usize) {
-        let (agent, ball) = (PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS);
-        (AgentsAndBalls::new(&Physics::standard(), agents, agent, ball), 2 * agents)
+    fn bodies(agents: usize) -> Bodies {
+        AgentsAndBalls::new(&Physics::standard(), agents, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS)
     }
 
     fn new(task: &TaskConfig, blocks: usize) -> Result<Self, FieldError> {

@@ -28,12 +28,10 @@ pub(crate) struct SpreadObjective<const W: usize> {
 impl<const W: usize> Objective<W> for SpreadObjective<W> {
     type Bodies = Alike<f32>;
 
-    fn first_covering(_: usize) -> usize {
-        0
-    }
+    const BODIES: usize = 1;
 
-    fn bodies(agents: usize) -> (Alike<f32>, usize) {
-        (Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE)), agents)
+    fn bodies(_: usize) -> Alike<f32> {
+        Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE))
     }
 
     fn new(task: &TaskConfig, blocks: usize) -> Result<Self, FieldError> {

@@ -42,7 +42,8 @@ pub(crate) fn verify(root: &Field<'_>) -> Result<Report, FieldError> {
             let moment = recorded.get("yaw_torque_Nm")?.number()?;
             thrust = worse(thrust, relative(craft.yaw_moment(rpm[i]), moment));
             let field = recorded.get("gnd_N")?;
-            match (craft.ground_effect(positions[i], attitudes[i], rpm[i]), field.is_null()) {
+            let (r, thrusts) = (Mat3::of(attitudes[i]), craft.thrust(rpm[i]));
+            match (craft.ground_effect(positions[i], attitudes[i], &r, thrusts), field.is_null()) {
                 (None, true) => {}
                 (Some(ours), false) => {
                     for (ours, theirs) in ours.into_iter().zip(field.array::<4>()?) {
@@ -54,7 +55,7 @@ pub(crate) fn verify(root: &Field<'_>) -> Result<Report, FieldError> {
             }
             let world = craft.drag(velocities[i], rpm_before[i]);
             drag = worse(drag, relative_vector(world, recorded.get("drag_world_N")?.array()?));
-            let body = Mat3::of(attitudes[i]).back(world);
+            let body = r.back(world);
             drag = worse(drag, relative_vector(body, recorded.get("drag_body_N")?.array()?));
             let here = positions[i];
             let others = (0..n)

@@ -73,8 +73,6 @@ pub(super) struct Recording {
     pub contact_margin: f64,
     /// Force of an action.
     pub sensitivity: f64,
-    /// Direction of each action.
-    pub directions: [[f64; 2]; 5],
     /// N.
     pub agents: usize,
     /// `[N + balls]` everything that forces act on: agents, then balls.
@@ -108,14 +106,20 @@ impl Recording {
             return Err(speed.wrong("is not supported; must be null"));
         }
         let directions = meta.get("action_uxuy")?;
-        let direction = |action| directions.get(action)?.array();
+        for (action, direction) in
+            [("0", [0.0, 0.0]), ("1", [1.0, 0.0]), ("2", [-1.0, 0.0]), ("3", [0.0, 1.0]), ("4", [0.0, -1.0])]
+        {
+            let field = directions.get(action)?;
+            if field.array()? != direction {
+                return Err(field.wrong(format!("must be {direction:?}")));
+            }
+        }
         Ok(Self {
             dt: meta.get("dt")?.positive()?,
             damping: meta.get("damping")?.number()?,
             contact_force: meta.get("contact_force")?.number()?,
             contact_margin: meta.get("contact_margin")?.positive()?,
             sensitivity: meta.get("action_sensitivity")?.number()?,
-            directions: [direction("0")?, direction("1")?, direction("2")?, direction("3")?, direction("4")?],
             scenario: if pushing {
                 let ball = root.get("ball_of_agent")?.each(n, |ball| ball.index(balls))?;
                 let landmark = root.get("land_of_agent")?.each(n, |landmark| landmark.index(g))?;

@@ -3,7 +3,8 @@
 use super::recording::{Body, Frame, Recording, Scenario};
 use crate::report::{Report, worse};
 use magex_core::task::PushBallConfig;
-use magex_env::particles::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use magex_env::particles::physics::{AgentsAndBalls, Alike, Bodies, Pair, Physics};
+use magex_env::particles::swarm::Swarm;
 use magex_env::{CONTACT_DISTANCE, Real};
 
 /// Largest one-step, reward and success difference of an agreeing f64 simulator.
@@ -51,79 +52,6 @@ impl<R: Real> Bodies<R> for Mixed<R> {
     }
 }
 
-/// The bodies in W worlds, and a step of them.
-struct World<'a, R, const W: usize, B> {
-    recording: &'a Recording,
-    physics: Physics<R>,
-    bodies: B,
-    /// x, y, vx, vy: `[bodies][W]` each.
-    state: [Vec<[R; W]>; 4],
-    forces: [Vec<[R; W]>; 3],
-    pairs: Pairs,
-}
-
-impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
-    fn new(recording: &'a Recording, physics: Physics<R>, bodies: B) -> Self {
-        let zero = || vec![[R::ZERO; W]; recording.bodies.len()];
-        Self {
-            recording,
-            physics,
-            bodies,
-            state: [zero(), zero(), zero(), zero()],
-            forces: [zero(), zero(), zero()],
-            pairs: Pairs::new(),
-        }
-    }
-
-    /// Puts world `w` into a recorded state.
-    fn load(&mut self, w: usize, frame: &Frame) {
-        for i in 0..self.recording.bodies.len() {
-            let [x, y] = frame.positions[i];
-            let [vx, vy] = frame.velocities[i];
-            for (lanes, value) in self.state.iter_mut().zip([x, y, vx, vy]) {
-                lanes[i][w] = R::from_f64(value);
-            }
-        }
-    }
-
-    /// World w does the actions of step `steps[w]`.
-    fn step(&mut self, steps: [usize; W]) {
-        let [x, y, vx, vy] = &mut self.state;
-        let found = find_pairs(&self.bodies, (x, y), &mut self.pairs);
-        let [fx, fy, hits] = &mut self.forces;
-        let mut forces = Forces { x: fx, y: fy, hits };
-        forces.sum(&self.physics, &self.bodies, (x, y), &self.pairs[..found]);
-        let recording = self.recording;
-        let control = |i: usize| {
-            let (mut ux, mut uy) = ([R::ZERO; W], [R::ZERO; W]);
-            if i >= recording.agents {
-                return (ux, uy);
-            }
-            for w in 0..W {
-                let [dx, dy] = recording.directions[usize::from(recording.actions[steps[w]][i])];
-                ux[w] = self.physics.sensitivity * R::from_f64(dx);
-                uy[w] = self.physics.sensitivity * R::from_f64(dy);
-            }
-            (ux, uy)
-        };
-        Motion { x, y, vx, vy }.advance(&self.physics, &self.bodies, (fx, fy), control);
-    }
-
-    /// Largest difference of world `w` from a frame: positions, velocities; divided by max(1, |recorded|) if `relative`.
-    fn error(&self, w: usize, frame: &Frame, relative: bool) -> [f64; 2] {
-        let mut worst = [0.0; 2];
-        for i in 0..self.recording.bodies.len() {
-            let ([x, y], [vx, vy]) = (frame.positions[i], frame.velocities[i]);
-            for (k, recorded) in [x, y, vx, vy].into_iter().enumerate() {
-                let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
-                let ours: f64 = self.state[k][i][w].into();
-                worst[k / 2] = worse(worst[k / 2], (ours - recorded).abs() / scale);
-            }
-        }
-        worst
-    }
-}
-
 /// Compares the kernels and the authors' formulas with a recording.
 pub(super) fn verify(recording: &Recording) -> Report {
     let (double, single) = (physics::<f64>(recording), physics::<f32>(recording));
@@ -156,63 +84,66 @@ pub(super) fn verify(recording: &Recording) -> Report {
 }
 
 /// One step from every recorded state, and the free run from the first one.
-fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double: A, single: B) -> Report {
-    let one_step_f32 = one_step(World::new(recording, physics(recording), single), true);
-    let one_step = one_step(World::new(recording, physics(recording), double.clone()), false);
-    let (free, free_run) = free_run(World::new(recording, physics(recording), double));
+fn replay<A: Bodies<f64> + Clone, B: Bodies<f32> + Clone>(recording: &Recording, double: A, single: B) -> Report {
     let (agents, steps) = (recording.agents, recording.actions.len());
+    let free = recording.divergence.iter().take_while(|&&divergence| divergence <= WELL_CONDITIONED).count();
     let mut report =
         Report { content: format!("N = {agents}, {steps} steps, {free} of them free"), ..Report::default() };
-    report.limited("one step", one_step, ONE_STEP);
+    report.limited("one step", one_step(recording, &double, false), ONE_STEP);
     // There is no bound that holds for every recording.
-    report.informative(
-        "one step in f32",
-        one_step_f32,
-        "contacts multiply the rounding of a position by their stiffness",
-    );
+    let words = "contacts multiply the rounding of a position by their stiffness";
+    report.informative("one step in f32", one_step(recording, &single, true), words);
+    let mut world = worlds::<f64, 1, A>(recording, &recording.frames[..1], double);
+    let free_run = recording.actions[..free].iter().zip(&recording.frames[1..]).fold(0.0, |worst, (actions, frame)| {
+        world.step(0, actions);
+        worse(worst, apart(&world, std::slice::from_ref(frame), false)[0])
+    });
     report.limited("free run", free_run, FREE_RUN);
     report
 }
 
 fn physics<R: Real>(recording: &Recording) -> Physics<R> {
-    Physics::new(
-        recording.dt,
-        recording.damping,
-        recording.contact_force,
-        recording.contact_margin,
-        recording.sensitivity,
-    )
+    let Recording { dt, damping, contact_force, contact_margin, sensitivity, .. } = *recording;
+    Physics::new(dt, damping, contact_force, contact_margin, sensitivity)
+}
+
+/// Worlds in recorded states.
+fn worlds<R: Real, const W: usize, B: Bodies<R>>(recording: &Recording, frames: &[Frame], kinds: B) -> Swarm<R, W, B> {
+    let bodies = recording.bodies.len();
+    let numbers = |points: fn(&Frame) -> &[[f64; 2]]| -> Vec<R> {
+        let moving = frames.iter().flat_map(|frame| points(frame)[..bodies].as_flattened());
+        moving.map(|&number| R::from_f64(number)).collect()
+    };
+    let (positions, velocities) = (numbers(|frame| &frame.positions), numbers(|frame| &frame.velocities));
+    Swarm::new(physics(recording), kinds, (recording.agents, bodies), [&positions, &velocities, &[]], None)
+}
+
+/// Largest difference of worlds from recorded frames: positions, velocities; over max(1, |recorded|) if `relative`.
+fn apart<R: Real, const W: usize, B: Bodies<R>>(worlds: &Swarm<R, W, B>, frames: &[Frame], relative: bool) -> [f64; 2] {
+    let bodies = worlds.bodies();
+    let mut ours = vec![R::ZERO; 2 * bodies * frames.len()];
+    let difference = |ours: &[R], points: fn(&Frame) -> &[[f64; 2]]| {
+        let recorded = frames.iter().flat_map(|frame| points(frame)[..bodies].as_flattened());
+        ours.iter().zip(recorded).fold(0.0, |worst, (&ours, &recorded)| {
+            let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
+            let ours: f64 = ours.into();
+            worse(worst, (ours - recorded).abs() / scale)
+        })
+    };
+    worlds.write_positions(&mut ours);
+    let positions = difference(&ours, |frame| &frame.positions);
+    worlds.write_velocities(&mut ours);
+    [positions, difference(&ours, |frame| &frame.velocities)]
 }
 
 /// The worst coordinate after one step from every recorded state.
-fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: bool) -> f64 {
-    let recording = world.recording;
-    let last = recording.actions.len().saturating_sub(1);
-    let mut worst = 0.0;
-    for first in (0..recording.actions.len()).step_by(LANES) {
-        // Lanes beyond the last step repeat it.
-        let steps: [usize; LANES] = std::array::from_fn(|w| (first + w).min(last));
-        for (w, &step) in steps.iter().enumerate() {
-            world.load(w, &recording.frames[step]);
-        }
-        world.step(steps);
-        for (w, &step) in steps.iter().enumerate() {
-            worst = world.error(w, &recording.frames[step + 1], relative).into_iter().fold(worst, worse);
-        }
-    }
-    worst
-}
-
-/// Steps compared and the worst position on the way.
-fn free_run<B: Bodies<f64>>(mut world: World<'_, f64, 1, B>) -> (usize, f64) {
-    let recording = world.recording;
-    let steps = recording.divergence.iter().take_while(|&&divergence| divergence <= WELL_CONDITIONED).count();
-    world.load(0, &recording.frames[0]);
-    let worst = (0..steps).fold(0.0, |worst, step| {
-        world.step([step]);
-        worse(worst, world.error(0, &recording.frames[step + 1], false)[0])
-    });
-    (steps, worst)
+fn one_step<R: Real, B: Bodies<R> + Clone>(recording: &Recording, kinds: &B, relative: bool) -> f64 {
+    recording.actions.chunks(LANES).enumerate().fold(0.0, |worst, (block, actions)| {
+        let (first, last) = (LANES * block, LANES * block + actions.len());
+        let mut worlds = worlds::<R, LANES, B>(recording, &recording.frames[first..last], kinds.clone());
+        worlds.step(0, &actions.concat());
+        apart(&worlds, &recording.frames[first + 1..=last], relative).into_iter().fold(worst, worse)
+    })
 }
 
 /// As the authors write it: no fused operations, so that comparisons fall the same way.

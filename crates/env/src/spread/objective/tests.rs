@@ -94,7 +94,8 @@ fn kicks(positions: &[f64]) -> Vec<f64> {
     let agents = positions.len() / 2;
     let kinds = Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE));
     let rest = vec![0.0; positions.len()];
-    let mut swarm = Swarm::<f64, 4, _>::new(kinds, (agents, agents), [positions, &rest, positions], None);
+    let mut swarm =
+        Swarm::<f64, 4, _>::new(Physics::standard(), kinds, (agents, agents), [positions, &rest, positions], None);
     swarm.step(0, &vec![0; agents]);
     let mut velocities = vec![0.0; positions.len()];
     swarm.write_velocities(&mut velocities);
