@@ -24,7 +24,6 @@ use candle_nn::Module;
 use local::LocalNet;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
-use std::sync::Arc;
 use team::TeamNet;
 
 pub use model::{Model, Part};
@@ -140,7 +139,7 @@ impl NeighbourEncoder {
     fn forward(&self, features: &Features) -> CandleResult<Tensor> {
         let shape = (features.counts.len(), self.neighbours, self.width);
         let neighbours = Tensor::from_slice(&features.neighbours, shape, &Device::Cpu)?;
-        neighbour_pool(&neighbours, Arc::new(features.counts.clone()), &self.w, &self.b)
+        neighbour_pool(&neighbours, features.counts.clone(), &self.w, &self.b)
     }
 }
 

@@ -76,7 +76,7 @@ fn recurrent_unit() {
 #[test]
 fn neighbour_pool() {
     let features = Tensor::from_vec(normal(5 * 3 * 4, 1), (5, 3, 4), &Device::Cpu).unwrap();
-    let counts = Arc::new(vec![3, 0, 1, 2, 3]);
+    let counts = vec![3, 0, 1, 2, 3];
     let (w, b) = (var(&[4, 20], 2), var(&[20], 3));
     check(&[&w, &b], &|| ops::neighbour_pool(&features, counts.clone(), &w, &b).unwrap());
 }
