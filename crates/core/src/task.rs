@@ -15,10 +15,10 @@ use crate::metrics_table::{METRICS, Metric, Scope};
 use crate::statics::{LANDMARKS, StaticSpec};
 use crate::trajectory::Shape;
 use crate::{sha256, toml_table};
-use definition::Definition;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+pub use definition::Definition;
 pub use drones::{Downwash, DroneConfig};
 pub use observation::{Frame, Observation};
 pub use push_ball::PushBallConfig;
@@ -216,13 +216,9 @@ impl TaskConfig {
         self
     }
 
-    fn definition(&self) -> &'static Definition {
+    /// What the task says about itself, whatever its size.
+    pub fn definition(&self) -> &'static Definition {
         self.name.definition()
-    }
-
-    /// Name for people.
-    pub fn title(&self) -> &'static str {
-        self.definition().title
     }
 
     /// D: space dimensions of positions.
@@ -238,21 +234,6 @@ impl TaskConfig {
     /// X: further numbers of an agent's state that an agent sees and the wire carries.
     pub fn agent_state(&self) -> usize {
         self.definition().agent_state
-    }
-
-    /// Whether agents can crash and then are out of the episode.
-    pub fn crashes(&self) -> bool {
-        self.definition().crashes
-    }
-
-    /// Radius that a landmark is drawn with, world units.
-    pub fn landmark_radius(&self) -> f32 {
-        self.definition().landmark_radius
-    }
-
-    /// Seconds per joint step.
-    pub fn step_seconds(&self) -> f32 {
-        self.definition().step_seconds
     }
 
     /// Choices of each action component.
@@ -329,7 +310,7 @@ impl Metric {
     pub fn applies(&self, task: &TaskConfig) -> bool {
         match self.scope {
             Scope::EveryTask => true,
-            Scope::Crashes => task.crashes(),
+            Scope::Crashes => task.definition().crashes,
             Scope::SecondStage => task.stages().len() > 1,
         }
     }

@@ -13,7 +13,7 @@ pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
     format!(
         "{}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
-        task.title(),
+        task.definition().title,
         task.agents,
         task.spawn,
         config.executor.kind,

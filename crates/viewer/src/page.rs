@@ -37,10 +37,11 @@ const FAREWELL: Duration = Duration::from_secs(2);
 const QUIET: Duration = Duration::from_millis(500);
 
 /// What the training thread is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
     /// Training has not begun.
+    #[default]
     Starting,
     /// Waiting for training episodes.
     Collecting,
@@ -73,7 +74,7 @@ pub struct RunInfo {
 }
 
 /// State of the run as the training thread reports it.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Run {
     run_id: String,
     phase: Phase,
@@ -137,15 +138,7 @@ impl LivePage {
             info,
             task: words,
             scene: Scene::of(task),
-            run: Mutex::new(Run {
-                run_id: String::new(),
-                phase: Phase::Starting,
-                end: None,
-                version: None,
-                sha256: String::new(),
-                latest: Value::Null,
-                summary: Value::Null,
-            }),
+            run: Mutex::default(),
             points: Mutex::default(),
             episode: Mutex::default(),
             snapshot: Mutex::default(),
@@ -228,11 +221,6 @@ impl LivePage {
         }
     }
 
-    /// Records that a request was answered.
-    fn answered(&self) {
-        *lock(&self.asked) = Some(Instant::now());
-    }
-
     fn change(&self, change: impl FnOnce(&mut Run)) {
         change(&mut lock(&self.run));
         self.revision.send_modify(|revision| *revision += 1);
@@ -253,10 +241,6 @@ impl LivePage {
 
     fn current(&self) -> u64 {
         *self.revision.borrow()
-    }
-
-    fn episode(&self) -> Option<Episode> {
-        lock(&self.episode).clone()
     }
 
     /// The rows of the curves after line `after`; all of them if `process` is not this process.

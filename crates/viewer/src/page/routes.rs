@@ -16,10 +16,11 @@ use axum::routing::get;
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use magex_proto::v1;
+use magex_runtime::sync::lock;
 use sha2::{Digest as _, Sha256};
 use std::future::Future;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 const PAGE: &str = include_str!("page.html");
 
@@ -113,7 +114,7 @@ async fn limited(page: &LivePage, answer: impl Future<Output = Response>) -> Res
             .into_response();
     };
     let answer = answer.await;
-    page.answered();
+    *lock(&page.asked) = Some(Instant::now());
     answer
 }
 
@@ -123,7 +124,7 @@ fn json(body: Bytes) -> Response {
 
 /// The latest evaluation episode; 304 if the client has it already, 204 if there is none yet.
 fn episode_of(page: &LivePage, headers: &HeaderMap) -> Response {
-    let Some(episode) = page.episode() else { return StatusCode::NO_CONTENT.into_response() };
+    let Some(episode) = lock(&page.episode).clone() else { return StatusCode::NO_CONTENT.into_response() };
     let tag = format!("\"{}\"", episode.tag);
     if headers.get(IF_NONE_MATCH).is_some_and(|known| known.as_bytes() == tag.as_bytes()) {
         return (StatusCode::NOT_MODIFIED, [(ETAG, tag)]).into_response();
