@@ -55,12 +55,12 @@ pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 ///
 /// Positions that are given with velocities of more than 2 m/s do not keep them: they are the first target velocities.
 pub struct Flight {
-    pub(crate) laws: Laws,
+    laws: Laws,
     config: DroneConfig,
     agents: usize,
     /// Physics steps per command.
     hold: u32,
-    pub(crate) episodes: Vec<Episode>,
+    episodes: Vec<Episode>,
     /// `[B, N, 3]`
     landmarks: Vec<f32>,
 }

@@ -2,7 +2,7 @@
 //! balls) in world units (and per second), landmarks `[B, N, 2]`, goals `[B, N, 2]` (the agent's ball, that ball's landmark),
 //! actions and rewards `[B, N]`. Balls move by contact only.
 
-pub mod layouts;
+mod layouts;
 
 mod constants;
 pub(crate) mod law;
@@ -18,8 +18,8 @@ use magex_core::statics::LANDMARKS;
 use magex_core::task::TaskConfig;
 use objective::PushBallObjective;
 
-pub use constants::{REACHED, SPACING};
-pub use start::{Start, spawn};
+pub(crate) use constants::REACHED;
+use start::spawn;
 
 /// Draws the start of one episode. In training, starts in line with balls are mixed in
 /// (`task.push_ball.start_in_line_fraction`).

@@ -10,6 +10,7 @@ use magex_core::metrics_table::{
 };
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Downwash, Spawn, TaskName, TaskSettings};
+use magex_core::trajectory::EpisodeMetrics;
 use proptest::prelude::*;
 use rapier3d::prelude::Vector;
 

@@ -22,7 +22,7 @@ const ASIDE: f64 = 0.6;
 
 /// The start of an episode. Balls start 0.3 from each other, agents 0.2 from each other and 0.25 from balls.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Start {
+pub(super) struct Start {
     /// `[N, 2]`
     pub agents: Vec<f32>,
     /// `[N, 2]`
@@ -34,7 +34,7 @@ pub struct Start {
 /// Draws the start of an episode from its own stream. What `training` may add is drawn last, so that the same stream
 /// gives an evaluation episode the same start whatever `task.push_ball.start_in_line_fraction` is. An error if the task is
 /// another one.
-pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Result<Start, FieldError> {
+pub(super) fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Result<Start, FieldError> {
     let in_line = task.push_ball()?.start_in_line_fraction;
     let mut start = match task.spawn {
         Spawn::Uniform => uniform(task.agents, task.side, stream),

@@ -212,7 +212,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert_eq!(bad.err(), Some(FieldError::new("positions[0]", "NaN is not finite")));
     let mut task = task;
     task.side = -1.0;
-    assert!(new_env(&task, streams(1), false).unwrap_err().to_string().contains("task.side"));
+    assert!(new_env(&task, streams(1), false).err().unwrap().to_string().contains("task.side"));
 }
 
 #[test]
