@@ -1,7 +1,5 @@
 //! Drones (paper, section 5.1.2): Crazyflie 2.X quadrotors with the dynamics and the controller of gym-pybullet-drones
-//! 2.1.0, integrated by rapier.
-//!
-//! Units are SI, z is up, quaternions are `[x, y, z, w]` and turn body vectors into world vectors; velocities and
+//! 2.1.0, integrated by rapier. Units are SI, z is up, quaternions are `[x, y, z, w]` and turn body vectors into world vectors; velocities and
 //! angular velocities are in the world frame. Motors 0..3 are front right, rear right, rear left, front left.
 //!
 //! The authors' own environment for this task is not published: its physics is (the simulator's), spawn, success radius,
@@ -47,11 +45,10 @@ pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 /// * **Score.** Success: share of landmarks with a drone that is not out within 0.15 m. Collision rate: share of drones
 ///   that are out; collisions per agent and step: the same divided by the commands.
 ///
-/// Drag and ground effect are those of the reference. Its downwash ([`Craft::downwash`]) is singular: two drones at
-/// almost equal height, as all are here, press each other down with 1 / Δz². Side by side at 0.3 m, the least distance of
-/// the spawn, a drone 5 mm lower is pushed down with 263 times its weight and is shot into the ground (a test measures
-/// it). So the default bounds the force of one upper drone by m g, its thrust in hover: a wash carries no more momentum
-/// than the thrust that makes it.
+/// Drag and ground effect are those of the reference. Its downwash ([`Craft::downwash`]) is singular: side by side at 0.3 m,
+/// the least distance of the spawn, a drone 5 mm lower is pushed down with 263 times its weight and is shot into the ground
+/// (a test measures it). So the default bounds the force of one upper drone by m g, its thrust in hover: a wash carries no
+/// more momentum than the thrust that makes it.
 ///
 /// Positions that are given with velocities of more than 2 m/s do not keep them: they are the first target velocities.
 pub struct Flight {
@@ -98,7 +95,6 @@ impl Flight {
         self.episodes.iter().flat_map(|episode| &episode.world.drones)
     }
 
-    /// Landmarks [N, 3] of an episode.
     fn landmarks(&self, episode: usize) -> &[f32] {
         &self.landmarks[3 * self.agents * episode..3 * self.agents * (episode + 1)]
     }

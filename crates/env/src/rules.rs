@@ -50,7 +50,6 @@ pub(crate) struct Starts {
     pub(crate) positions: Vec<f32>,
     /// [B, E, D]
     pub(crate) velocities: Vec<f32>,
-    /// The static arrays of the episodes.
     pub(crate) statics: Statics,
 }
 

@@ -80,7 +80,6 @@ pub struct Decision {
     pub probabilities: Vec<f32>,
 }
 
-/// A network that scores instances.
 enum Net {
     Pairwise(PairwiseNet),
     Ranking(RankingNet),

@@ -84,7 +84,6 @@ pub fn build(
     })
 }
 
-/// A fully connected layer.
 pub(crate) struct Layer {
     w: Tensor,
     b: Tensor,

@@ -272,7 +272,7 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         assert_eq!(out.dims(), [steps * sequences * agents, 5]);
         let gradient = params.gradient(&vars, &probe(&out).backward().unwrap()).unwrap();
         for entry in params.entries.clone() {
-            let own = &gradient[entry.start..entry.start + entry.len()];
+            let own = &gradient[entry.range()];
             assert!(own.iter().all(|g| g.is_finite()), "{name} {kind}: {}", entry.name);
             let largest = (0..own.len()).max_by(|&a, &b| own[a].abs().total_cmp(&own[b].abs())).unwrap();
             assert!(own[largest] != 0.0, "{name} {kind}: {} has no gradient", entry.name);

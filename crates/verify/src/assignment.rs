@@ -9,9 +9,7 @@ use magex_core::error::FieldError;
 #[cfg(test)]
 mod tests;
 
-/// Name of the recording's format.
 pub(crate) const FORMAT: &str = "assignment-golden-1";
-/// Largest relative error of a cost.
 const TOLERANCE: f64 = 1e-9;
 /// Most rows, columns and problems of a recording.
 const MOST: usize = 100_001;
@@ -66,7 +64,6 @@ fn compare(case: &Case, solver: &mut Solver, mismatches: &mut Vec<String>) -> f6
     error
 }
 
-/// A problem as recorded.
 struct Case {
     name: String,
     rows: usize,

@@ -1,9 +1,9 @@
 //! Agreement with recordings of gym-pybullet-drones: trajectories (`drone-golden-1`), calls of the controller
 //! (`drone-controller-golden-1`) and forces of the effects (`drone-forces-golden-1`).
 //!
-//! A trajectory is asked four questions. Does one step of the reference model from every recorded state lead to the
-//! next one (insensitive to chaos)? Does a whole run stay with the recorded one while it is well conditioned? Does the
-//! controller, fed the recorded states, give the recorded rpm? Does it hold the same in closed loop?
+//! A flight is asked four questions: does one step of the reference model from every recorded state lead to the next one
+//! (insensitive to chaos); does a whole run stay with the recorded one while it is well conditioned; does the controller,
+//! fed the recorded states, give the recorded rpm; and does it hold the same in closed loop?
 
 mod calls;
 mod engine;
@@ -19,11 +19,8 @@ use recording::Trajectory;
 pub(crate) use calls::verify as verify_calls;
 pub(crate) use forces::verify as verify_forces;
 
-/// Format of flights.
 pub(crate) const FLIGHT: &str = "drone-golden-1";
-/// Format of calls of the controller.
 pub(crate) const CALLS: &str = "drone-controller-golden-1";
-/// Format of forces of the effects.
 pub(crate) const FORCES: &str = "drone-forces-golden-1";
 /// Largest one-step difference of the reference model, over max(1, |recorded|).
 const ONE_STEP: f64 = 1e-12;

@@ -1,10 +1,8 @@
 //! Agreement with recordings of the authors' simulator (format `mpe-golden-1`).
 //!
-//! A recording holds the bodies, the constants, the initial state, the actions and every following state in f64, with
-//! the reward, the success rate and the overlaps the authors' code computed. Three questions are asked of it:
-//! does one step from every recorded state lead to the next one (insensitive to chaos); does a whole run from the
-//! initial state stay with the recorded one for as long as the system is well conditioned; and do the authors' own
-//! formulas, defects included, give the recorded reward and success.
+//! Three questions are asked: does one step from every recorded state lead to the next one (insensitive to chaos); does a
+//! whole run from the initial state stay with the recorded one for as long as the system is well conditioned; and do the
+//! authors' own formulas, defects included, give the recorded reward and success.
 
 mod recording;
 mod replay;
@@ -14,7 +12,6 @@ use crate::report::Report;
 use magex_core::error::FieldError;
 use recording::Recording;
 
-/// Name of the recording's format.
 pub(crate) const FORMAT: &str = "mpe-golden-1";
 /// The scenarios that are simulated: Simple Spread and Push Ball.
 pub(crate) const SCENARIOS: [&str; 2] = ["spread", "push_ball"];

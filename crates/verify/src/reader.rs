@@ -16,7 +16,6 @@ impl<'a> Field<'a> {
         Self { path: String::new(), value }
     }
 
-    /// An error that names this field.
     pub(crate) fn wrong(&self, problem: impl Into<String>) -> FieldError {
         let field = if self.path.is_empty() { "recording" } else { &self.path };
         FieldError::new(field, problem)
@@ -46,7 +45,6 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Whether the field is JSON's null.
     pub(crate) fn is_null(&self) -> bool {
         self.value.is_null()
     }
@@ -65,7 +63,6 @@ impl<'a> Field<'a> {
         number.ok_or_else(|| self.wrong("must be a finite number"))
     }
 
-    /// A finite number above zero.
     pub(crate) fn positive(&self) -> Result<f64, FieldError> {
         let number = self.number()?;
         if number > 0.0 { Ok(number) } else { Err(self.wrong(format!("{number} must be above 0"))) }

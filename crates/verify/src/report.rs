@@ -18,9 +18,7 @@ pub struct Check {
 pub(crate) struct Report {
     /// What was compared, for example `N = 50, 120 steps`.
     pub(crate) content: String,
-    /// The differences.
     pub(crate) checks: Vec<Check>,
-    /// Disagreements that are no numbers.
     pub(crate) mismatches: Vec<String>,
 }
 

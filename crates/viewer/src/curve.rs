@@ -26,10 +26,7 @@ impl MetricsLine {
 }
 
 /// Reads a metrics file. An unterminated last line is ignored (the run may be writing it). If an iteration occurs twice
-/// because the run was resumed before it, the later line counts.
-///
-/// # Errors
-/// A line that is not a JSON object with `iteration` and `joint_env_steps`; a file without lines.
+/// because the run was resumed before it, the later line counts. A file without lines is refused.
 pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, FieldError> {
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let mut lines: Vec<MetricsLine> = Vec::new();
@@ -57,14 +54,12 @@ fn empty() -> FieldError {
     FieldError::new("metrics.jsonl", "no iterations yet; wait for the first one to finish")
 }
 
-/// One diagram of the picture.
 struct Panel {
     title: String,
     scale: Scale,
     series: Vec<Series>,
 }
 
-/// One curve of a panel.
 struct Series {
     label: &'static str,
     colour: &'static str,
@@ -86,7 +81,6 @@ impl Panel {
         (measured || metric.scope == Scope::EveryTask).then_some(Self { title, scale, series })
     }
 
-    /// Height of the plot in pixels.
     fn height(&self) -> f64 {
         if self.scale == Scale::Share { 220.0 } else { 130.0 }
     }
@@ -109,10 +103,7 @@ const GRID: &str = "#e4e7ec";
 const BLUE: &str = "#2f6fde";
 const GREEN: &str = "#1d9a62";
 
-/// The picture as SVG text. `title` is the run's name, `subtitle` its configuration in one line.
-///
-/// # Errors
-/// No lines.
+/// The picture of at least one line as SVG text. `title` is the run's name, `subtitle` its configuration in one line.
 pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, FieldError> {
     let last = lines.last().ok_or_else(empty)?.joint_env_steps.max(1) as f64;
     let panels: Vec<Panel> = METRICS.iter().filter_map(|metric| Panel::of(metric, lines)).collect();

@@ -96,7 +96,6 @@ struct Episode {
 #[derive(Debug)]
 struct Snapshot {
     made: Instant,
-    /// Whether the run had ended.
     over: bool,
     body: Bytes,
 }
@@ -117,7 +116,6 @@ pub struct LivePage {
     /// Incremented by every change of the fields above.
     revision: watch::Sender<u64>,
     viewers: Semaphore,
-    /// When the last request was answered.
     asked: Mutex<Option<Instant>>,
 }
 

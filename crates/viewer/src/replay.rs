@@ -18,11 +18,8 @@ struct Page<'a> {
     episodes: Vec<PackedEpisode<'a>>,
 }
 
-/// The page of a task's episodes, ready to be written to a file. The scores, if known, are shown beside the numbers that the
-/// page computes.
-///
-/// # Errors
-/// No episodes, and recordings whose arrays do not fit their shape or the task, or are not finite.
+/// The page of a task's episodes, and of their scores if these are known. It refuses no episodes, and recordings whose
+/// arrays do not fit their shape or the task, or are not finite.
 pub fn replay_html(
     task: &TaskConfig,
     title: &str,

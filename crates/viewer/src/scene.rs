@@ -1,8 +1,6 @@
-//! A recorded episode as a page draws it: sizes of the task and packed states. [`SCRIPT`] draws it, on the live page and in
-//! replay files.
+//! A recorded episode as the live page and replay files draw it: sizes of the task and packed states.
 //!
-//! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
-//! and knows no task by name; three dimensions are seen from above, from the side and in space.
+//! [`SCRIPT`] computes what it shows (covered landmarks, contacts, arrival) from these, and knows no task by name.
 
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;

@@ -21,7 +21,6 @@ pub struct Definition {
     pub(super) action_code: ActionCode,
     /// Assignment problems of an episode, in order.
     pub(super) stages: &'static [Stage],
-    /// Static arrays of an episode.
     pub(super) statics: fn(&TaskConfig) -> Vec<StaticSpec>,
     pub(super) observation: Observation,
     /// Radius that a landmark is drawn with, world units.
@@ -42,7 +41,6 @@ pub struct Definition {
     pub(super) validate: fn(&TaskConfig) -> Result<(), FieldError>,
 }
 
-/// Steps rounded up to tens.
 pub(super) fn up_to_tens(steps: f32) -> u32 {
     (steps / 10.0).ceil() as u32 * 10
 }

@@ -1,6 +1,6 @@
 //! A hand-written pilot: what a drone that knows its landmark can reach without learning.
 
-use crate::controller::interface::{Controller, check};
+use super::{Controller, check};
 use crate::drones::{ACCELERATION, MOST_SPEED};
 use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;

@@ -4,7 +4,7 @@
 //! happens does not: of all sequences of three actions, each held for two steps, the agent starts the one after which its
 //! ball would come to rest best, and itself be best placed to push on.
 
-use crate::controller::interface::{Controller, check};
+use super::{Controller, check};
 use crate::particles::physics::{Bodies, Forces, Motion, Pair, Physics, pack};
 use crate::push_ball::REACHED;
 use crate::push_ball::law::angle;

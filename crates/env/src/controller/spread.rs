@@ -1,6 +1,6 @@
 //! The yardstick of Simple Spread: full thrust towards the goal, braking in time.
 
-use crate::controller::interface::{Controller, check};
+use super::{Controller, check};
 use crate::particles::physics::Physics;
 use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;

@@ -1,59 +1,41 @@
 //! The cascaded PID controller of gym-pybullet-drones (`DSLPIDControl`, CF2X gains): position and velocity to rpm.
 
+use super::constants::cf2x;
 use super::linalg::{Mat3, V3, add, cross, dot, norm, roll_pitch_yaw, scale, sub, times};
 use super::model::Craft;
 
-/// Gains and limits. Forces in N, torques in units of the motors' PWM.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gains {
-    /// N per m.
-    pub p_force: [f64; 3],
-    /// N per m s.
-    pub i_force: [f64; 3],
-    /// N per m/s.
-    pub d_force: [f64; 3],
-    /// PWM per unit of attitude error.
-    pub p_torque: [f64; 3],
-    /// PWM per unit of attitude error and second.
-    pub i_torque: [f64; 3],
-    /// PWM per rad/s.
-    pub d_torque: [f64; 3],
-    /// Bound of the position integral, m s; every axis is also bounded by the first.
-    pub most_position_integral: [f64; 3],
-    /// Bound of the attitude integral, rad s; every axis is also bounded by the last.
-    pub most_attitude_integral: [f64; 3],
-    /// Bound of the torques, PWM.
-    pub most_torque: f64,
-    /// rpm per PWM.
-    pub rpm_per_pwm: f64,
-    /// rpm at PWM 0.
-    pub rpm_at_zero: f64,
-    /// Least PWM.
-    pub least_pwm: f64,
-    /// Largest PWM.
-    pub most_pwm: f64,
-    /// Torque of each axis on each motor.
-    pub mixer: [[f64; 3]; 4],
-}
-
-impl Gains {
-    /// The reference's gains for the Crazyflie 2.X.
-    pub const CF2X: Self = Self {
-        p_force: [0.4, 0.4, 1.25],
-        i_force: [0.05, 0.05, 0.05],
-        d_force: [0.2, 0.2, 0.5],
-        p_torque: [70_000.0, 70_000.0, 60_000.0],
-        i_torque: [0.0, 0.0, 500.0],
-        d_torque: [20_000.0, 20_000.0, 12_000.0],
-        most_position_integral: [2.0, 2.0, 0.15],
-        most_attitude_integral: [1.0, 1.0, 1500.0],
-        most_torque: 3200.0,
-        rpm_per_pwm: 0.2685,
-        rpm_at_zero: 4070.3,
-        least_pwm: 20_000.0,
-        most_pwm: 65_535.0,
-        mixer: [[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]],
-    };
+cf2x! {
+    /// Gains and limits. Forces in N, torques in units of the motors' PWM.
+    Gains {
+        /// N per m.
+        p_force: [f64; 3] = [0.4, 0.4, 1.25];
+        /// N per m s.
+        i_force: [f64; 3] = [0.05, 0.05, 0.05];
+        /// N per m/s.
+        d_force: [f64; 3] = [0.2, 0.2, 0.5];
+        /// PWM per unit of attitude error.
+        p_torque: [f64; 3] = [70_000.0, 70_000.0, 60_000.0];
+        /// PWM per unit of attitude error and second.
+        i_torque: [f64; 3] = [0.0, 0.0, 500.0];
+        /// PWM per rad/s.
+        d_torque: [f64; 3] = [20_000.0, 20_000.0, 12_000.0];
+        /// Bound of the position integral, m s; every axis is also bounded by the first.
+        most_position_integral: [f64; 3] = [2.0, 2.0, 0.15];
+        /// Bound of the attitude integral, rad s; every axis is also bounded by the last.
+        most_attitude_integral: [f64; 3] = [1.0, 1.0, 1500.0];
+        /// Bound of the torques, PWM.
+        most_torque: f64 = 3200.0;
+        /// rpm per PWM.
+        rpm_per_pwm: f64 = 0.2685;
+        /// rpm at PWM 0.
+        rpm_at_zero: f64 = 4070.3;
+        /// Least PWM.
+        least_pwm: f64 = 20_000.0;
+        /// Largest PWM.
+        most_pwm: f64 = 65_535.0;
+        /// Torque of each axis on each motor.
+        mixer: [[f64; 3]; 4] = [[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]];
+    }
 }
 
 /// What the controller remembers; all zero at the start.

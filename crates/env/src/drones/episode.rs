@@ -9,7 +9,6 @@ use crate::matching::maximum_matching;
 use crate::rules::Score;
 use magex_core::task::DroneConfig;
 
-/// An episode.
 pub(super) struct Episode {
     pub(super) world: World,
     memories: Vec<Memory>,
@@ -22,7 +21,6 @@ pub(super) struct Episode {
     rpm: Vec<[f64; 4]>,
     /// First command after which the landmarks were covered, 0 while it has not happened.
     arrival: u32,
-    /// Sum of the rewards of all drones.
     reward: f64,
 }
 
@@ -177,7 +175,6 @@ impl Episode {
     }
 }
 
-/// A target velocity of at most 2 m/s.
 fn limited(velocity: V3) -> V3 {
     let speed = norm(velocity);
     if speed > MOST_SPEED { scale(velocity, MOST_SPEED / speed) } else { velocity }

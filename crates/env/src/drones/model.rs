@@ -6,63 +6,46 @@
 //! *previous* step ("lagged"), the engine's damping is linear plus quadratic, drag uses the rpm of the previous step
 //! and world-frame coefficients.
 
+use super::constants::cf2x;
 use super::linalg::{Mat3, POLE, V3, add, cross, dot, norm, product, scale, sine_of_pitch, times, unit};
 
-/// Constants of a quadrotor and of the engine it was recorded with. SI units.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Craft {
-    /// Mass in kg.
-    pub mass: f64,
-    /// Gravity in m/s².
-    pub gravity: f64,
-    /// Principal inertia in kg m², body axes.
-    pub inertia: [f64; 3],
-    /// Arm in m: the lever of the explicit variant is arm / √2.
-    pub arm: f64,
-    /// Propellers in the body frame, m.
-    pub propellers: [[f64; 3]; 4],
-    /// Thrust in N per rpm².
-    pub kf: f64,
-    /// Yaw moment in N m per rpm².
-    pub km: f64,
-    /// Sign of each motor's yaw moment.
-    pub yaw_signs: [f64; 4],
-    /// Radius of a propeller in m.
-    pub propeller_radius: f64,
-    /// Coefficient of the ground effect.
-    pub ground: f64,
-    /// Drag in N per (m/s) per (rad/s), world axes.
-    pub drag: [f64; 3],
-    /// Coefficients of the downwash.
-    pub downwash: [f64; 3],
-    /// The engine's damping of velocities in 1/s.
-    pub linear_damping: f64,
-    /// The engine's damping of angular velocities in 1/s.
-    pub angular_damping: f64,
-    /// The engine's bound on every coordinate of velocity and angular velocity, in m/s and rad/s.
-    pub most_speed: f64,
+cf2x! {
+    /// Constants of a quadrotor and of the engine it was recorded with. SI units.
+    Craft {
+        /// Mass in kg.
+        mass: f64 = 0.027;
+        /// Gravity in m/s².
+        gravity: f64 = 9.8;
+        /// Principal inertia in kg m², body axes.
+        inertia: [f64; 3] = [1.4e-5, 1.4e-5, 2.17e-5];
+        /// Arm in m: the lever of the explicit variant is arm / √2.
+        arm: f64 = 0.0397;
+        /// Propellers in the body frame, m.
+        propellers: [[f64; 3]; 4] = [[0.028, -0.028, 0.0], [-0.028, -0.028, 0.0], [-0.028, 0.028, 0.0], [0.028, 0.028, 0.0]];
+        /// Thrust in N per rpm².
+        kf: f64 = 3.16e-10;
+        /// Yaw moment in N m per rpm².
+        km: f64 = 7.94e-12;
+        /// Sign of each motor's yaw moment.
+        yaw_signs: [f64; 4] = [-1.0, 1.0, -1.0, 1.0];
+        /// Radius of a propeller in m.
+        propeller_radius: f64 = 0.0231348;
+        /// Coefficient of the ground effect.
+        ground: f64 = 11.36859;
+        /// Drag in N per (m/s) per (rad/s), world axes.
+        drag: [f64; 3] = [9.1785e-7, 9.1785e-7, 10.311e-7];
+        /// Coefficients of the downwash.
+        downwash: [f64; 3] = [2267.18, 0.16, -0.11];
+        /// The engine's damping of velocities in 1/s: Bullet's default of 0.04, stored there as f32.
+        linear_damping: f64 = 0.039_999_999_105_930_33;
+        /// The engine's damping of angular velocities in 1/s.
+        angular_damping: f64 = 0.039_999_999_105_930_33;
+        /// The engine's bound on every coordinate of velocity and angular velocity, in m/s and rad/s.
+        most_speed: f64 = 100.0;
+    }
 }
 
 impl Craft {
-    /// Crazyflie 2.X (`cf2x.urdf`), and Bullet's default damping of 0.04, stored there as f32.
-    pub const CF2X: Self = Self {
-        mass: 0.027,
-        gravity: 9.8,
-        inertia: [1.4e-5, 1.4e-5, 2.17e-5],
-        arm: 0.0397,
-        propellers: [[0.028, -0.028, 0.0], [-0.028, -0.028, 0.0], [-0.028, 0.028, 0.0], [0.028, 0.028, 0.0]],
-        kf: 3.16e-10,
-        km: 7.94e-12,
-        yaw_signs: [-1.0, 1.0, -1.0, 1.0],
-        propeller_radius: 0.0231348,
-        ground: 11.36859,
-        drag: [9.1785e-7, 9.1785e-7, 10.311e-7],
-        downwash: [2267.18, 0.16, -0.11],
-        linear_damping: 0.039_999_999_105_930_33,
-        angular_damping: 0.039_999_999_105_930_33,
-        most_speed: 100.0,
-    };
-
     /// m g, in N.
     pub fn weight(&self) -> f64 {
         self.mass * self.gravity

@@ -17,7 +17,6 @@ pub(crate) trait Objective<const W: usize>: Sized + Send {
     /// Bodies per agent: agents come first, and the last N bodies cover landmarks.
     const BODIES: usize;
 
-    /// The bodies of a world.
     fn bodies(agents: usize) -> Self::Bodies;
 
     /// Until goals are set they are at the origin.

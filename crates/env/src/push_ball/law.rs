@@ -9,9 +9,7 @@ use magex_core::task::PushBallConfig;
 pub(super) struct Legs {
     /// Φ, minus the way left.
     pub(super) potential: f32,
-    /// d_ab + d_bl.
     pub(super) distance: f32,
-    /// d_bl².
     pub(super) last2: f32,
 }
 

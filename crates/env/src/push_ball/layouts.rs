@@ -18,15 +18,12 @@ pub(super) struct Layout {
 
 /// The sizes that tell the two sets apart.
 struct Set {
-    /// Half the length of every line.
     half: f64,
     /// Height of the slots' lines in layouts 0, 1 and 3.
     heights: [f64; 3],
-    /// Radii of the slots' circles.
     circles: [f64; 2],
     /// Share of the slots that is on the inner circle.
     inner: f64,
-    /// Radius of the balls' circle.
     circle: f64,
 }
 

@@ -8,7 +8,6 @@ use crate::particles::swarm::Swarm;
 use magex_core::error::FieldError;
 use magex_core::task::{PushBallConfig, TaskConfig};
 
-/// REACHED².
 const REACHED2: f32 = REACHED as f32 * REACHED as f32;
 
 type Bodies = AgentsAndBalls<f32>;

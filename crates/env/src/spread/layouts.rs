@@ -17,17 +17,14 @@ pub struct Layout {
 
 /// The sizes that tell the two sets apart.
 struct Set {
-    /// Half the length of the agents' lines.
     half: f64,
     /// Height of the agents' lines in layouts 0 and 1.
     heights: [f64; 2],
-    /// Radii of the agents' circles.
     circles: [f64; 2],
     /// Half the distance between the two landmark lines of layout 1, and half their length.
     columns: f64,
     /// Half the side of the landmarks' square; its corners are left free.
     square: f64,
-    /// Radius of the landmarks' circle.
     circle: f64,
 }
 

@@ -15,11 +15,18 @@ const HEAD_WIDTH: usize = 16;
 /// Where an agent's team feature E_a comes from.
 enum Team {
     /// Observation Encoder with a fully connected GCN, then hard Gumbel-softmax blocks.
-    Graph { encode: Layer, blocks: Vec<Block>, literal: bool },
-    /// Ablation -Atten.
-    Attention { qkv: Layer, out: Layer },
-    /// Ablation -MLP.
-    Concat { mix: Layer },
+    Graph {
+        encode: Layer,
+        blocks: Vec<Block>,
+        literal: bool,
+    },
+    Attention {
+        qkv: Layer,
+        out: Layer,
+    },
+    Concat {
+        mix: Layer,
+    },
 }
 
 struct Block {

@@ -43,12 +43,12 @@ pub(super) trait Operation<const N: usize>: Send + Sync + 'static {
     fn backward(&self, args: [Arg<'_>; N], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; N]>;
 }
 
-/// Applies an operation; the first argument is made contiguous, the others are.
+/// Applies an operation; the first argument is made contiguous, others are.
 pub(super) fn apply1(operation: impl Operation<1>, x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Custom(operation))
 }
 
-/// Applies an operation; the first argument is made contiguous, the others are.
+/// The same for three arguments.
 pub(super) fn apply3(operation: impl Operation<3>, [x, b, c]: [&Tensor; 3]) -> Result<Tensor> {
     x.contiguous()?.apply_op3(b, c, Custom(operation))
 }

@@ -24,9 +24,8 @@ pub struct PickTable {
     pub picks: Vec<Pick>,
 }
 
-/// Sequential masked softmax: for every pick the log-probability of its column among the columns still free, and the
-/// entropy of that choice. `scores` is flat; the result [2, P] stacks log-probabilities and entropies of all picks of all
-/// instances. With one row for all picks this is the Plackett–Luce likelihood of a ranking.
+/// Sequential masked softmax: [2, P] log-probability of every pick's column among those still free, and entropy of that
+/// choice, from flat `scores`. With one row for all picks this is the Plackett–Luce likelihood of a ranking.
 pub fn pick_log_probs(scores: &Tensor, tables: Arc<Vec<PickTable>>) -> Result<Tensor> {
     apply1(PickLogProbs { tables }, &scores.flatten_all()?)
 }
@@ -45,7 +44,6 @@ pub(crate) type Mask = [f32];
 /// maximum the sum could underflow late in a ranking.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct MaskedSoftmax {
-    /// Largest free score.
     pub(crate) max: f32,
     log_sum: f32,
 }

@@ -117,7 +117,6 @@ fn run(recording: &Trajectory, laws: &Laws, steps: usize) -> [f64; 3] {
     worst
 }
 
-/// Angle between two attitudes, degrees.
 fn angle(a: [f64; 4], b: [f64; 4]) -> f64 {
     let [x, y, z, w] = magex_env::drones::linalg::product(a, [-b[0], -b[1], -b[2], b[3]]);
     2.0 * libm::atan2(libm::sqrt(x * x + y * y + z * z), w.abs()).to_degrees()

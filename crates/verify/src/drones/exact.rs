@@ -16,7 +16,6 @@ struct Flight {
 }
 
 impl Flight {
-    /// The recorded state before step `t`.
     fn at(recording: &Trajectory, t: usize) -> Self {
         let drones = 0..recording.drones;
         Self {

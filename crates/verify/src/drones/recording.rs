@@ -15,20 +15,15 @@ const UNIT: f64 = 1e-3;
 /// What moved the drones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Physics {
-    /// Bullet's integration with these effects.
     Bullet(Effects),
-    /// The explicit model.
     Explicit,
 }
 
 /// What commanded the motors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Mode {
-    /// The recording's own rpm.
     Rpm,
-    /// Tracking of a velocity.
     Velocity,
-    /// Tracking of a position and a yaw.
     Position,
 }
 
@@ -37,7 +32,6 @@ pub(super) enum Mode {
 pub(super) struct Trace {
     /// Velocity: direction and fraction of the speed limit; position: x, y, z, yaw.
     pub(super) command: Vec<[f64; 4]>,
-    /// Collective PWM.
     pub(super) thrust_pwm: Vec<f64>,
     /// Intrinsic X-Y-Z angles of the target attitude.
     pub(super) target_euler: Vec<[f64; 3]>,
@@ -46,19 +40,12 @@ pub(super) struct Trace {
 /// A recorded flight.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Trajectory {
-    /// Constants of the drone.
     pub(super) craft: Craft,
-    /// Gains of the controller.
     pub(super) gains: Gains,
-    /// The name of the physics, as the file says it.
     pub(super) physics_name: String,
-    /// The physics.
     pub(super) physics: Physics,
-    /// The mode.
     pub(super) mode: Mode,
-    /// Physics steps per second.
     pub(super) physics_hz: f64,
-    /// Control periods per second.
     pub(super) control_hz: f64,
     /// Seconds per physics step.
     pub(super) dt: f64,
@@ -80,11 +67,9 @@ pub(super) struct Trajectory {
     pub(super) control: Vec<Trace>,
     /// Whether a perturbation grows too fast for free runs to be compared to the end.
     pub(super) chaotic: bool,
-    /// Steps of the free run.
     pub(super) horizon: usize,
 }
 
-/// A unit quaternion.
 pub(super) fn quaternion(field: &Field<'_>) -> Result<[f64; 4], FieldError> {
     let q = field.array::<4>()?;
     let length = libm::sqrt(q.iter().map(|c| c * c).sum());
@@ -207,7 +192,6 @@ impl Trajectory {
         })
     }
 
-    /// T.
     pub(super) fn steps(&self) -> usize {
         self.rpm.len()
     }
@@ -217,7 +201,6 @@ impl Trajectory {
         self.frames[t.saturating_sub(1)][drone].attitude
     }
 
-    /// The rpm before step `t`.
     pub(super) fn rpm_before(&self, t: usize, drone: usize) -> [f64; 4] {
         if t == 0 { [0.0; 4] } else { self.rpm[t - 1][drone] }
     }

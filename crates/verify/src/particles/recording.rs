@@ -46,14 +46,12 @@ pub(super) struct Frame {
 /// Which task was recorded, and what only its recordings have.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Scenario {
-    /// Simple Spread.
     Spread {
         /// `[N]` landmark of each agent.
         goals: Vec<usize>,
         /// Unit of the distances in the reward.
         distance_unit: f64,
     },
-    /// Push Ball.
     PushBall {
         /// `[N]` ball and landmark of each agent.
         goals: Vec<[usize; 2]>,

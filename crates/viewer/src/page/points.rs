@@ -78,7 +78,6 @@ pub(super) struct Points {
 }
 
 impl Points {
-    /// Adds a line of metrics.jsonl.
     pub(super) fn push(&mut self, line: &Value) {
         self.last += 1;
         let number = |value: Option<&Value>| value.and_then(Value::as_f64).map_or(f32::NAN, |x| x as f32);
@@ -96,7 +95,6 @@ impl Points {
         }
     }
 
-    /// Number of the last line.
     pub(super) fn last(&self) -> u64 {
         self.last
     }
