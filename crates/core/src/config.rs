@@ -284,7 +284,8 @@ impl RunConfig {
 
     /// Episodes per iteration unless they are chosen: about 200 agents' worth, a multiple of the shards.
     pub fn derived_episodes(&self) -> u32 {
-        derived_episodes(self.task.agents, self.collect.shards_per_iteration)
+        let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
+        wanted.next_multiple_of(self.collect.shards_per_iteration.max(1))
     }
 
     /// Joint environment steps of one iteration.
@@ -323,12 +324,6 @@ impl RunConfig {
         }
         Ok(())
     }
-}
-
-/// See [`RunConfig::derived_episodes`].
-fn derived_episodes(agents: usize, shards: u32) -> u32 {
-    let wanted = (200 / agents.max(1) as u32).clamp(4, 64);
-    wanted.next_multiple_of(shards.max(1))
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use magex_core::metrics_table::{
     ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
     SPAWN_SUCCESS_RATE, SUCCESS_RATE,
 };
-use magex_core::statics::{LANDMARKS, Statics};
+use magex_core::statics::Statics;
 use magex_core::task::{ActionCode, Group, Stage, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, Shape};
 
@@ -16,7 +16,7 @@ use magex_core::trajectory::{EpisodeMetrics, Shape};
 /// Episode b is a function of the task, its stream, its goals and its actions: not of B, not of b.
 pub struct Env<R: Rules + ?Sized = dyn Rules> {
     pub(crate) rules: Box<R>,
-    shape: Shape,
+    pub(crate) shape: Shape,
     action_code: ActionCode,
     stages: &'static [Stage],
     statics: Statics,
@@ -24,7 +24,8 @@ pub struct Env<R: Rules + ?Sized = dyn Rules> {
     spawn_success: Vec<f32>,
     /// [B, N, K]; empty until they are set.
     goals: Vec<u32>,
-    steps: u32,
+    /// Joint steps done so far, up to T.
+    pub(crate) steps: u32,
 }
 
 impl<R: Rules + ?Sized> Env<R> {
@@ -43,24 +44,9 @@ impl<R: Rules + ?Sized> Env<R> {
         }
     }
 
-    /// B.
-    pub fn episodes(&self) -> usize {
-        self.shape.episodes
-    }
-
-    /// Joint steps done so far, up to T.
-    pub fn steps(&self) -> u32 {
-        self.steps
-    }
-
     /// The static arrays of the episodes; see [`TaskConfig::statics`].
     pub fn statics(&self) -> &Statics {
         &self.statics
-    }
-
-    /// [B, G, D]
-    pub fn landmarks(&self) -> &[f32] {
-        self.statics.get(LANDMARKS)
     }
 
     /// The present positions [B, E, D], agents first, then balls.

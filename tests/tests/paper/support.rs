@@ -9,7 +9,6 @@ use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::TaskConfig;
 use magex_core::trajectory::{ShardResult, Trajectory};
-use magex_env::Env;
 use magex_learner::collector::Collector;
 use magex_learner::run_events::{CollectError, StopReason};
 use magex_learner::train::learned::{Learned, Network};
@@ -72,12 +71,6 @@ pub(crate) fn scores(commander: &Commander, team: &Team<'_>) -> Vec<f32> {
 
 pub(crate) fn stream(k: u32) -> Stream {
     Key::new(7, Purpose::Spawn, &[k]).stream()
-}
-
-pub(crate) fn positions(env: &Env, task: &TaskConfig) -> Vec<f32> {
-    let mut out = vec![0.0; env.episodes() * (task.agents + task.balls()) * task.dims()];
-    env.write_positions(&mut out).unwrap();
-    out
 }
 
 /// A collector that keeps what was collected.

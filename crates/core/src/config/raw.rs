@@ -54,20 +54,21 @@ pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
     refuse_renamed(&file)?;
     let sections: Sections = toml_table::read("", file)?;
     let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
-    let RawCollect { episodes_per_iteration, shards_per_iteration } = toml_table::read("collect", sections.collect)?;
-    let episodes_per_iteration = match episodes_per_iteration {
-        Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO).into()),
-        Some(episodes) => episodes,
-        None => super::derived_episodes(task.agents, shards_per_iteration),
-    };
-    Ok(RunConfig {
+    let collect: RawCollect = toml_table::read("collect", sections.collect)?;
+    let mut config = RunConfig {
         run: toml_table::read("run", sections.run)?,
         task,
         executor: toml_table::read("executor", sections.executor)?,
         commander: toml_table::read("commander", sections.commander)?,
-        collect: CollectConfig { episodes_per_iteration, shards_per_iteration },
+        collect: CollectConfig { episodes_per_iteration: 0, shards_per_iteration: collect.shards_per_iteration },
         mappo: toml_table::read("mappo", sections.mappo)?,
-    })
+    };
+    config.collect.episodes_per_iteration = match collect.episodes_per_iteration {
+        Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO).into()),
+        Some(episodes) => episodes,
+        None => config.derived_episodes(),
+    };
+    Ok(config)
 }
 
 fn refuse_renamed(file: &Table) -> Result<(), FieldError> {

@@ -2,7 +2,7 @@
 
 use super::constants::cf2x;
 use super::linalg::{Mat3, V3, add, cross, dot, norm, roll_pitch_yaw, scale, sub, times};
-use super::model::Craft;
+use super::model::{Craft, State};
 
 cf2x! {
     /// Gains and limits. Forces in N, torques in units of the motors' PWM.
@@ -49,15 +49,11 @@ pub struct Memory {
     pub last_angles: [f64; 3],
 }
 
-/// What the controller sees and what it is asked for.
+/// What the controller sees (it computes angular velocities itself) and what it is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Request {
-    /// m.
-    pub position: [f64; 3],
-    /// Unit quaternion.
-    pub attitude: [f64; 4],
-    /// m/s.
-    pub velocity: [f64; 3],
+    /// The present state.
+    pub state: State,
     /// m.
     pub target_position: [f64; 3],
     /// m/s.
@@ -70,16 +66,8 @@ pub struct Request {
 
 impl Request {
     /// Track a velocity: the present place and the present yaw are the targets, so that only the velocity counts.
-    pub fn velocity(position: [f64; 3], attitude: [f64; 4], velocity: [f64; 3], target: [f64; 3]) -> Self {
-        Self {
-            position,
-            attitude,
-            velocity,
-            target_position: position,
-            target_velocity: target,
-            target_yaw: None,
-            target_rates: [0.0; 3],
-        }
+    pub fn velocity(state: State, target_velocity: [f64; 3]) -> Self {
+        Self { state, target_position: state.position, target_velocity, target_yaw: None, target_rates: [0.0; 3] }
     }
 }
 
@@ -99,11 +87,11 @@ pub struct Answer {
 impl Memory {
     /// One call of the controller, `dt` seconds after the previous one.
     pub fn call(&mut self, craft: &Craft, gains: &Gains, request: &Request, dt: f64) -> Answer {
-        let now = Mat3::of(request.attitude);
-        let angles = roll_pitch_yaw(request.attitude);
+        let now = Mat3::of(request.state.attitude);
+        let angles = roll_pitch_yaw(request.state.attitude);
         // Position: a force.
-        let position_error = sub(request.target_position, request.position);
-        let velocity_error = sub(request.target_velocity, request.velocity);
+        let position_error = sub(request.target_position, request.state.position);
+        let velocity_error = sub(request.target_velocity, request.state.velocity);
         let [most, _, most_z] = gains.most_position_integral;
         let integral = add(self.position_integral, scale(position_error, dt)).map(|i| i.clamp(-most, most));
         self.position_integral = [integral[0], integral[1], integral[2].clamp(-most_z, most_z)];

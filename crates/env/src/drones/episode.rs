@@ -78,8 +78,7 @@ impl Episode {
                 self.rpm[i] = if drone.is_out() {
                     [0.0; 4]
                 } else {
-                    let state = drone.state();
-                    let request = Request::velocity(state.position, state.attitude, state.velocity, self.targets[i]);
+                    let request = Request::velocity(drone.state(), self.targets[i]);
                     self.memories[i].call(&laws.craft, &Gains::CF2X, &request, laws.dt).rpm
                 };
             }

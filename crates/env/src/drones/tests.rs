@@ -316,7 +316,7 @@ fn mistakes_are_named() {
     assert!(text(drones.step(&[1; 5], &mut [0.0; 2])).contains("actions: 5"));
     assert!(text(drones.step(&[1; 6], &mut [0.0; 3])).contains("rewards: 3"));
     assert!(text(drones.write_agent_state(&mut [0.0; 11])).contains("agent_state"));
-    assert_eq!(drones.steps(), 0);
+    assert_eq!(drones.steps, 0);
     let refused = |positions: &[f32]| from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
     assert!(refused(&[0.0; 5]).contains("positions"));
     assert!(refused(&[0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0]).contains("positions[2]"));
@@ -351,7 +351,7 @@ proptest! {
         let drones = new_env(&task, std::iter::once(stream(k))).unwrap();
         let mut positions = vec![0.0; 3 * n];
         drones.write_positions(&mut positions).unwrap();
-        for points in [&positions[..], drones.landmarks()] {
+        for points in [&positions[..], drones.statics().get(LANDMARKS)] {
             let points: Vec<[f32; 3]> = points.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
             prop_assert!(apart(&points, 0.3 - 1e-5));
             prop_assert!(points.iter().all(|p| p[0].abs() <= 1.5 && p[1].abs() <= 1.5 && p[2] == 1.5));

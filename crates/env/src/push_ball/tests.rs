@@ -65,7 +65,7 @@ fn the_reward_is_the_documented_one_of_the_step() {
             let expected = 2.0 * (potential(&now) - potential(before)) + bonus;
             assert!((f64::from(rewards[b]) - expected).abs() < 2e-5, "{action} {b}: {} {expected}", rewards[b]);
         }
-        assert!((env.scores()[0][REWARD] - rewards[0]).abs() < 1e-6 && env.steps() == 1 && task.horizon > 1);
+        assert!((env.scores()[0][REWARD] - rewards[0]).abs() < 1e-6 && env.steps == 1 && task.horizon > 1);
     }
 }
 
@@ -182,7 +182,7 @@ fn run(env: &mut Env, goals: &[u32], seed: u32, steps: u32, table: impl Fn(u32, 
     let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
     env.set_goals(goals).unwrap();
     let mut rewards = vec![0.0; goals.len() / 2];
-    let mut log = vec![bits(env.landmarks())];
+    let mut log = vec![bits(env.statics().get(LANDMARKS))];
     for step in 0..steps {
         let actions: Vec<u8> = (0..rewards.len()).map(|k| table(seed + step, k)).collect();
         env.step(&actions, &mut rewards).unwrap();
@@ -227,7 +227,7 @@ fn cells_and_lanes_give_the_same_bits() {
         let mut task = task(agents, Spawn::Uniform);
         task.side = side;
         let mut lanes = new_env(&task, streams(1), false).unwrap();
-        let (positions, landmarks) = (lanes.positions(), lanes.landmarks().to_vec());
+        let (positions, landmarks) = (lanes.positions(), lanes.statics().get(LANDMARKS).to_vec());
         let rest = vec![0.0; positions.len()];
         let mut cells = new_env(&task, streams(1), false).unwrap();
         let starts = Starts::given(&task, [&positions, &rest, &landmarks]).unwrap();
@@ -321,7 +321,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(env.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(env.write_positions(&mut [0.0; 20]).is_err() && env.write_velocities(&mut [0.0; 41]).is_err());
     assert!(env.write_agent_state(&mut [0.0]).is_err() && env.write_agent_state(&mut []).is_ok());
-    assert_eq!((env.positions(), env.steps()), (before, 0));
+    assert_eq!((env.positions(), env.steps), (before, 0));
     for _ in 0..task.horizon {
         env.step(&[0; 10], &mut rewards).unwrap();
     }
@@ -346,5 +346,5 @@ fn a_batch_of_nothing_is_fine() {
     let mut env = new_env(&task(5, Spawn::Uniform), streams(0), false).unwrap();
     env.set_goals(&[]).unwrap();
     env.step(&[], &mut []).unwrap();
-    assert_eq!((env.episodes(), env.positions().len(), env.scores().len()), (0, 0, 0));
+    assert_eq!((env.shape.episodes, env.positions().len(), env.scores().len()), (0, 0, 0));
 }

@@ -200,7 +200,7 @@ fn wrong_calls_are_named_and_change_nothing() {
     assert!(spread.step(&[0; 9], &mut rewards).is_err());
     assert!(spread.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(spread.write_positions(&mut [0.0; 19]).is_err());
-    assert_eq!((spread.positions(), spread.steps()), (before, 0));
+    assert_eq!((spread.positions(), spread.steps), (before, 0));
     for _ in 0..task.horizon {
         spread.step(&[0; 10], &mut rewards).unwrap();
     }
@@ -220,5 +220,5 @@ fn a_batch_of_nothing_is_fine() {
     let mut spread = new_env(&task(5), streams(0), false).unwrap();
     spread.set_goals(&[]).unwrap();
     spread.step(&[], &mut []).unwrap();
-    assert_eq!((spread.episodes(), spread.positions().len()), (0, 0));
+    assert_eq!((spread.shape.episodes, spread.positions().len()), (0, 0));
 }

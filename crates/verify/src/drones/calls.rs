@@ -7,6 +7,7 @@ use crate::reader::Field;
 use crate::report::{Report, worse};
 use magex_core::error::FieldError;
 use magex_env::drones::control::{Memory, Request};
+use magex_env::drones::model::State;
 
 /// Most sequences, and calls of a sequence.
 const MOST: usize = 1_000_000;
@@ -22,10 +23,14 @@ pub(crate) fn verify(root: &Field<'_>) -> Result<Report, FieldError> {
         for call in sequence.get("calls")?.items(MOST)? {
             calls += 1;
             let [_, _, yaw] = call.get("target_rpy")?.array()?;
-            let request = Request {
+            let state = State {
                 position: call.get("pos")?.array()?,
                 attitude: quaternion(&call.get("quat")?)?,
                 velocity: call.get("vel")?.array()?,
+                spin: [0.0; 3],
+            };
+            let request = Request {
+                state,
                 target_position: call.get("target_pos")?.array()?,
                 target_velocity: call.get("target_vel")?.array()?,
                 target_yaw: Some(yaw),

@@ -82,18 +82,14 @@ fn wash(recording: &Trajectory, states: &[State], i: usize) -> f64 {
 
 /// What drone `i` is asked for in control period `k`, seen from a state.
 fn request(recording: &Trajectory, k: usize, i: usize, state: &State) -> Request {
-    let command = recording.control[k].command[i];
-    let [a, b, c, last] = command;
+    let [a, b, c, last] = recording.control[k].command[i];
     if recording.mode == Mode::Velocity {
         let length = libm::sqrt(a * a + b * b + c * c);
         let speed = if length == 0.0 { 0.0 } else { recording.speed_limit * last.abs() / length };
-        let target = [speed * a, speed * b, speed * c];
-        Request::velocity(state.position, state.attitude, state.velocity, target)
+        Request::velocity(*state, [speed * a, speed * b, speed * c])
     } else {
         Request {
-            position: state.position,
-            attitude: state.attitude,
-            velocity: state.velocity,
+            state: *state,
             target_position: [a, b, c],
             target_velocity: [0.0; 3],
             target_yaw: Some(last),
