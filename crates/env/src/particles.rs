@@ -4,7 +4,7 @@ pub(crate) mod arrival;
 pub(crate) mod batch;
 pub(crate) mod cells;
 pub mod constants;
-pub mod curves;
+pub(crate) mod curves;
 pub mod physics;
 pub(crate) mod placement;
 pub mod real;

@@ -1,7 +1,7 @@
 //! Simple Spread (paper, section 5.1.1): its starts and its reward. Positions, velocities and landmarks are `[B, N, 2]` in
 //! world units (and per second), goals, actions and rewards `[B, N]`.
 
-pub mod layouts;
+pub(crate) mod layouts;
 pub mod start;
 
 mod objective;

@@ -7,7 +7,6 @@ use magex_core::ids::{RunId, Shard};
 use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
-use magex_core::task::TaskConfig;
 use magex_core::trajectory::{ShardResult, Trajectory};
 use magex_learner::collector::Collector;
 use magex_learner::run_events::{CollectError, StopReason};

@@ -41,11 +41,6 @@ impl<R: Real> Physics<R> {
     pub(crate) fn standard() -> Self {
         Self::new(0.1, 0.25, 100.0, 1e-3, 5.0)
     }
-
-    /// Distance from which a contact at `touch` is exactly zero here (see [`Real::NEGLIGIBLE`]).
-    pub fn reach(&self, touch: R) -> R {
-        R::NEGLIGIBLE.mul_add(self.margin, touch)
-    }
 }
 
 /// What two bodies are to each other.
@@ -67,7 +62,8 @@ impl<R: Real> Pair<R> {
     /// Two movable bodies of equal mass.
     pub fn equal(physics: &Physics<R>, touch: f64) -> Self {
         let touch = R::from_f64(touch);
-        let reach = physics.reach(touch);
+        // From there on a contact is exactly zero here.
+        let reach = R::NEGLIGIBLE.mul_add(physics.margin, touch);
         Self { touch, touch2: touch * touch, reach2: reach * reach, on_first: R::ONE, on_second: R::ONE }
     }
 }

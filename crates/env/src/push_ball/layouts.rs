@@ -11,9 +11,9 @@ use magex_core::task::TaskConfig;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Layout {
     /// The paper's orange points, for agents and landmarks; 2N in all.
-    pub slots: Points,
+    pub(super) slots: Points,
     /// The paper's pink points; N in all.
-    pub balls: Points,
+    pub(super) balls: Points,
 }
 
 /// The sizes that tell the two sets apart.

@@ -1,6 +1,6 @@
 //! The bodies around an agent, one by one.
 
-use super::{FeatureSpec, State, Symmetry};
+use super::{FeatureSpec, State, Symmetry, offset};
 
 /// Encounters farther ahead than this do not matter, seconds.
 const AHEAD: f32 = 2.0;
@@ -67,11 +67,8 @@ impl FeatureSpec {
     fn neighbour(&self, state: &State<'_>, (i, j): (usize, usize), square: f32, symmetry: Symmetry, out: &mut [f32]) {
         let o = &self.observation;
         let d = self.shape.dims;
-        let (mut offset, mut velocity) = ([0.0f32; 3], [0.0f32; 3]);
-        for c in 0..d {
-            offset[c] = state.p[j * d + c] - state.p[i * d + c];
-            velocity[c] = state.v[j * d + c] - state.v[i * d + c];
-        }
+        let (offset, velocity) =
+            (offset(state.position(i), state.position(j)).0, offset(state.velocity(i), state.velocity(j)).0);
         let (offset, velocity) = (symmetry.see(offset), symmetry.see(velocity));
         for c in 0..d {
             out[c] = offset[c];
