@@ -218,11 +218,6 @@ impl Craft {
         }
     }
 
-    /// One exact step.
-    pub fn step(&self, state: &State, inputs: &Inputs, effects: Effects, dt: f64) -> State {
-        self.integrate(state, &self.loads(state, inputs, effects), dt)
-    }
-
     /// One step of the explicit variant (`Physics.DYN`): no engine, no damping, no lag, body rates integrated on their
     /// own. `rates` are the body rates; the state's spin is what the reference reports, old attitude · new rates.
     pub fn step_explicit(&self, state: &State, rates: [f64; 3], rpm: [f64; 4], dt: f64) -> (State, [f64; 3]) {

@@ -33,7 +33,8 @@ impl Flight {
                 Physics::Bullet(effects) => {
                     let wash = if effects.downwash { wash(recording, &before, i) } else { 0.0 };
                     let inputs = Inputs { lagged: self.lagged[i], rpm: rpm[i], rpm_before: self.rpm_before[i], wash };
-                    recording.craft.step(&state, &inputs, effects, recording.dt)
+                    let loads = recording.craft.loads(&state, &inputs, effects);
+                    recording.craft.integrate(&state, &loads, recording.dt)
                 }
                 Physics::Explicit => {
                     let (next, rates) = recording.craft.step_explicit(&state, self.rates[i], rpm[i], recording.dt);
