@@ -208,14 +208,8 @@ fn orthogonal(shape: &[usize], gain: f64, stream: &mut Stream) -> Vec<f32> {
             basis.push(v);
         }
     }
-    let mut out = Vec::with_capacity(rows * columns);
-    for i in 0..rows {
-        for j in 0..columns {
-            let value = if rows <= columns { basis[i][j] } else { basis[j][i] };
-            out.push((gain * value) as f32);
-        }
-    }
-    out
+    let value = |i: usize, j: usize| if rows <= columns { basis[i][j] } else { basis[j][i] };
+    (0..rows * columns).map(|k| (gain * value(k / columns, k % columns)) as f32).collect()
 }
 
 #[cfg(test)]

@@ -86,12 +86,8 @@ impl Points {
         self.rows.push(Row { line: self.last, values });
         if self.rows.len() > KEPT {
             // From the newest backwards, so that the newest stays.
-            let newest = self.rows.len() - 1;
-            let mut index = 0;
-            self.rows.retain(|_| {
-                index += 1;
-                (newest + 1 - index).is_multiple_of(2)
-            });
+            self.rows = self.rows.drain(..).rev().step_by(2).collect();
+            self.rows.reverse();
         }
     }
 
