@@ -7,13 +7,14 @@ mod policy;
 use self::policy::{Carried, KeyedChooser};
 use buffers::{Buffers, chain};
 use magex_core::config::RunConfig;
+use magex_core::error::FieldError;
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
 use magex_core::statics::Statics;
 use magex_core::task::ActionCode;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
-use magex_env::{Controller, Env, EnvError, new_env, scripted};
+use magex_env::{Controller, Env, new_env, scripted};
 use magex_nets::executor::{Model, Policy};
 use magex_nets::features::Symmetry;
 use magex_nets::params::ParamError;
@@ -24,7 +25,7 @@ use magex_proto::goals::{GoalReply, GoalRequest};
 pub enum RolloutError<E> {
     /// The environment refused.
     #[error(transparent)]
-    Env(#[from] EnvError),
+    Env(#[from] FieldError),
     /// The weights do not fit, or the tensor library refused.
     #[error(transparent)]
     Weights(#[from] ParamError),
@@ -92,7 +93,7 @@ impl Roller {
         // Reset, then goals, then the first observation: an agent never sees a goal of another episode.
         let mut worlds = new_env(task, keys.iter().map(|k| k.spawn.stream()), keep)?;
         let mut state = Buffers::new(&shape, worlds.statics());
-        state.read(worlds.as_ref())?;
+        state.read(&worlds)?;
         let request = state.goal_request(&shape, task.stages(), shard, seed);
         let reply = assign(&request).map_err(RolloutError::Goals)?;
         state.goals = chain(&shape, &reply.goals);
@@ -114,7 +115,7 @@ impl Roller {
         let mut rewards = vec![0.0; b * n];
         let mut chosen = KeyedChooser::new(self.model.heads(), n, shard.mode, keys.iter().map(|k| k.action));
         for step in 0..=steps {
-            state.read(worlds.as_ref())?;
+            state.read(&worlds)?;
             if keep {
                 out.positions.extend_from_slice(&state.positions);
                 out.velocities.extend_from_slice(&state.velocities);
@@ -149,7 +150,7 @@ impl Roller {
                 out.rewards.extend_from_slice(&rewards);
             }
         }
-        let metrics = metrics(worlds.as_ref(), &reply, shape.goals_per_agent);
+        let metrics = metrics(&worlds, &reply, shape.goals_per_agent);
         if !keep {
             let recording = shard.record.then(|| Recording {
                 shape: Shape { episodes: 1, ..shape },
@@ -178,7 +179,7 @@ fn to_world(code: ActionCode, heads: usize, symmetries: &[Symmetry], actions: &m
 }
 
 /// What the episodes scored, and what the commander cost them.
-fn metrics(worlds: &dyn Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
+fn metrics(worlds: &Env, reply: &GoalReply, stages: usize) -> Vec<EpisodeMetrics> {
     let ratios: Vec<f32> = reply.costs.iter().zip(&reply.exact_costs).map(|(c, h)| c / h.max(1e-9)).collect();
     let mut episodes = worlds.scores();
     for (episode, ratios) in episodes.iter_mut().zip(ratios.chunks_exact(stages.max(1))) {

@@ -1,11 +1,12 @@
 //! The joint states of a shard's episodes, and the assignment problems that they start with.
 
+use magex_core::error::FieldError;
 use magex_core::ids::Shard;
 use magex_core::joint_state::{JointState, group_positions};
 use magex_core::statics::{LANDMARKS, Statics};
 use magex_core::task::Stage;
 use magex_core::trajectory::Shape;
-use magex_env::{Env, EnvError};
+use magex_env::Env;
 use magex_proto::goals::GoalRequest;
 
 /// The joint states of B episodes at one step, read from the environment.
@@ -29,7 +30,7 @@ impl Buffers {
         }
     }
 
-    pub(super) fn read(&mut self, worlds: &dyn Env) -> Result<(), EnvError> {
+    pub(super) fn read(&mut self, worlds: &Env) -> Result<(), FieldError> {
         worlds.write_positions(&mut self.positions)?;
         worlds.write_velocities(&mut self.velocities)?;
         worlds.write_agent_state(&mut self.agent_state)

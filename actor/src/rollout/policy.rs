@@ -88,7 +88,7 @@ impl Carried {
             hidden: std::mem::take(&mut self.hidden),
             noise,
         };
-        if let Some(states) = policy.act(&input, choose)?.states {
+        if let Some(states) = policy.act(&input, choose)? {
             self.hidden = states.flatten_all()?.to_vec1()?;
         }
         Ok(())

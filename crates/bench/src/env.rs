@@ -2,11 +2,12 @@
 
 use crate::report::Report;
 use magex::output::thousands;
+use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{DroneConfig, Spawn, TaskConfig, TaskName};
 use magex_env::controller::DroneScript;
-use magex_env::{Controller as _, Drones, Env as _, EnvError, new_env};
+use magex_env::{Controller as _, new_env};
 use serde_json::json;
 use std::time::Instant;
 
@@ -46,7 +47,7 @@ pub(crate) fn env(args: &EnvArgs) -> anyhow::Result<Report> {
 
 /// Joint steps per second of one core: `worlds` episodes of a task, random actions from a keyed table, spawned anew and
 /// scored at every horizon; contacts, collisions, rewards and arrival included. Runs for about `seconds`.
-fn throughput(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f64, EnvError> {
+fn throughput(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f64, FieldError> {
     let shape = task.shape(worlds);
     let table = random_actions(worlds * shape.agents * shape.action_components, task.action_heads()[0] as u32);
     let mut rewards = vec![0.0; worlds * shape.agents];
@@ -73,7 +74,7 @@ fn throughput(task: &TaskConfig, worlds: usize, seconds: f64) -> Result<f64, Env
 
 /// Commands per second of one core of the drone task: `episodes` episodes of N drones flown by the scripted controller,
 /// spawned anew and scored at every horizon; controllers, physics, contacts and rewards included. Runs for about `seconds`.
-fn drone_throughput(agents: usize, episodes: usize, seconds: f64) -> Result<f64, EnvError> {
+fn drone_throughput(agents: usize, episodes: usize, seconds: f64) -> Result<f64, FieldError> {
     let task = TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform);
     let numbers = agents * episodes;
     let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..agents as u32).collect();
@@ -83,7 +84,7 @@ fn drone_throughput(agents: usize, episodes: usize, seconds: f64) -> Result<f64,
     let (start, mut commands, mut round) = (Instant::now(), 0u64, 0);
     loop {
         let streams = (0..episodes as u32).map(|episode| Key::new(1, Purpose::Bench, &[3, round, episode]).stream());
-        let mut drones = Drones::new(&task, streams, false)?;
+        let mut drones = new_env(&task, streams, false)?;
         drones.set_goals(&goals)?;
         let statics = drones.statics().clone();
         for step in 0..task.horizon as usize {

@@ -65,3 +65,19 @@ pub(crate) fn check_range<T: PartialOrd + std::fmt::Display>(
         Err(FieldError::new(field, format!("{value} is outside {low}..={high}")))
     }
 }
+
+/// `Ok` if an array has as many entries as its shape asks for; `what` names them.
+pub fn check_count(field: &str, what: &str, found: usize, expected: usize) -> Result<(), FieldError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(FieldError::new(field, format!("{found} {what}, the shape asks for {expected}")))
+}
+
+/// `Ok` if every number is finite.
+pub fn check_finite(field: &str, values: &[f32]) -> Result<(), FieldError> {
+    match values.iter().position(|x| !x.is_finite()) {
+        None => Ok(()),
+        Some(place) => Err(FieldError::new(format!("{field}[{place}]"), format!("{} is not finite", values[place]))),
+    }
+}

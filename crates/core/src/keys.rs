@@ -20,27 +20,14 @@ pub struct EpisodeKeys {
 /// Keys of the b-th episode of a shard. Evaluation episodes are named by their set and index alone, so that a set does
 /// not depend on how it was cut into shards, nor on the iteration.
 pub fn episode_keys(seed: u64, shard: &Shard, b: u32) -> EpisodeKeys {
-    let episode = shard.first_episode + b;
-    match shard.kind {
-        ShardKind::Train => {
-            let key = |purpose| Key::new(seed, purpose, &[shard.iteration.0, episode]);
-            EpisodeKeys {
-                spawn: key(Purpose::Spawn),
-                action: key(Purpose::Action),
-                graph: key(Purpose::Graph),
-                commander: key(Purpose::Commander),
-            }
-        }
-        ShardKind::Eval => {
-            let key = |purpose| Key::new(seed, purpose, &[shard.eval_set, episode]);
-            EpisodeKeys {
-                spawn: key(Purpose::EvalSpawn),
-                action: key(Purpose::EvalAction),
-                graph: key(Purpose::EvalGraph),
-                commander: key(Purpose::EvalCommander),
-            }
-        }
-    }
+    use Purpose::{Action, Commander, EvalAction, EvalCommander, EvalGraph, EvalSpawn, Graph, Spawn};
+    let (set, purposes) = match shard.kind {
+        ShardKind::Train => (shard.iteration.0, [Spawn, Action, Graph, Commander]),
+        ShardKind::Eval => (shard.eval_set, [EvalSpawn, EvalAction, EvalGraph, EvalCommander]),
+    };
+    let [spawn, action, graph, commander] =
+        purposes.map(|purpose| Key::new(seed, purpose, &[set, shard.first_episode + b]));
+    EpisodeKeys { spawn, action, graph, commander }
 }
 
 /// Whether the b-th episode of a shard gets a random matching instead of the scheduler's, which happens to a given share

@@ -15,4 +15,5 @@ pub mod statics;
 pub mod task;
 pub mod trajectory;
 
+mod section;
 mod toml_table;

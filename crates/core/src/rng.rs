@@ -115,11 +115,6 @@ impl Stream {
         radius * libm::cos(2.0 * std::f64::consts::PI * self.uniform())
     }
 
-    /// Standard Gumbel.
-    pub fn gumbel(&mut self) -> f64 {
-        -libm::log(-libm::log((self.uniform() + 0.5 / 9_007_199_254_740_992.0).min(1.0 - 1e-16)))
-    }
-
     /// A whole number below `bound`, without bias (rejection). `bound` = 0 gives 0.
     pub fn below(&mut self, bound: u32) -> u32 {
         if bound <= 1 {

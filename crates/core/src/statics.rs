@@ -3,7 +3,7 @@
 //! Every task has "landmarks" [G, D]. A task with more (obstacles, say) lists them in its definition; rollout, wire, learner
 //! and validation carry whatever is listed.
 
-use crate::error::FieldError;
+use crate::error::{FieldError, check_count, check_finite};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
@@ -91,18 +91,8 @@ impl Statics {
 }
 
 fn check_array(array: &StaticArray, episodes: usize) -> Result<(), FieldError> {
-    let expected = episodes * array.width();
-    if array.values.len() != expected {
-        let problem = format!("{} numbers, the shape asks for {expected}", array.values.len());
-        return Err(FieldError::new(&*array.name, problem));
-    }
-    match array.values.iter().position(|x| !x.is_finite()) {
-        Some(place) => {
-            let problem = format!("{} is not finite", array.values[place]);
-            Err(FieldError::new(format!("{}[{place}]", array.name), problem))
-        }
-        None => Ok(()),
-    }
+    check_count(&array.name, "numbers", array.values.len(), episodes * array.width())?;
+    check_finite(&array.name, &array.values)
 }
 
 /// The static arrays of some consecutive episodes, borrowed.

@@ -15,10 +15,10 @@ use crate::metrics_table::{METRICS, Metric, Scope};
 use crate::statics::{LANDMARKS, StaticSpec};
 use crate::trajectory::Shape;
 use crate::{sha256, toml_table};
-use definition::Definition;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+pub use definition::Definition;
 pub use drones::{Downwash, DroneConfig};
 pub use observation::{Frame, Observation};
 pub use push_ball::PushBallConfig;
@@ -119,9 +119,9 @@ pub struct TaskConfig {
 }
 
 /// `[task]` as it is written: what is missing is derived from the team size.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[derive(Default, Deserialize)]
 #[serde(default)]
-pub struct RawTask {
+struct RawTask {
     name: Option<TaskName>,
     agents: Option<usize>,
     side: Option<f32>,
@@ -139,43 +139,37 @@ pub(crate) const NOT_ZERO: &str = "0 is not a size; leave it out for the default
 /// Changes whenever the physics, the spawn, the reward or the observation change their meaning: part of the fingerprint.
 pub const TASK_SEMANTICS: u32 = 2;
 
-impl RawTask {
-    /// Reads the keys of `[task]`. Ranges are checked by [`TaskConfig::validate`].
-    pub fn read(keys: Table) -> Result<Self, FieldError> {
-        toml_table::read("task", keys)
-    }
-
-    /// The task with what is missing filled in. Errors name a missing key, an explicit zero, an unknown key or a setting of
-    /// another task.
-    pub fn resolve(self) -> Result<TaskConfig, FieldError> {
-        let name = self.name.ok_or_else(|| FieldError::missing("task.name"))?;
-        let agents = self.agents.ok_or_else(|| FieldError::missing("task.agents"))?;
-        let spawn = self.spawn.ok_or_else(|| FieldError::missing("task.spawn"))?;
-        for (key, zero) in [
-            ("side", self.side == Some(0.0)),
-            ("horizon", self.horizon == Some(0)),
-            ("layout_scale", self.layout_scale == Some(0.0)),
-        ] {
-            if zero {
-                return Err(FieldError::new(format!("task.{key}"), NOT_ZERO));
-            }
+/// Reads the keys of `[task]` and fills in what is missing; ranges are checked by [`TaskConfig::validate`]. Errors name a
+/// missing key, an explicit zero, an unknown key or a setting of another task.
+pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
+    let raw: RawTask = toml_table::read("task", keys)?;
+    let name = raw.name.ok_or_else(|| FieldError::missing("task.name"))?;
+    let agents = raw.agents.ok_or_else(|| FieldError::missing("task.agents"))?;
+    let spawn = raw.spawn.ok_or_else(|| FieldError::missing("task.spawn"))?;
+    for (key, zero) in [
+        ("side", raw.side == Some(0.0)),
+        ("horizon", raw.horizon == Some(0)),
+        ("layout_scale", raw.layout_scale == Some(0.0)),
+    ] {
+        if zero {
+            return Err(FieldError::new(format!("task.{key}"), NOT_ZERO));
         }
-        let definition = name.definition();
-        let side = self.side.unwrap_or_else(|| (definition.side)(agents));
-        let mut own = Table::new();
-        for (key, value) in self.sections {
-            own = own_section(name, &key, value)?;
-        }
-        Ok(TaskConfig {
-            name,
-            agents,
-            side,
-            horizon: self.horizon.unwrap_or_else(|| (definition.horizon)(agents, side)),
-            spawn,
-            layout_scale: self.layout_scale.unwrap_or_else(|| (definition.layout_scale)(agents)),
-            settings: (definition.read_settings)(side, own)?,
-        })
     }
+    let definition = name.definition();
+    let side = raw.side.unwrap_or_else(|| (definition.side)(agents));
+    let mut own = Table::new();
+    for (key, value) in raw.sections {
+        own = own_section(name, &key, value)?;
+    }
+    Ok(TaskConfig {
+        name,
+        agents,
+        side,
+        horizon: raw.horizon.unwrap_or_else(|| (definition.horizon)(agents, side)),
+        spawn,
+        layout_scale: raw.layout_scale.unwrap_or_else(|| (definition.layout_scale)(agents)),
+        settings: (definition.read_settings)(side, own)?,
+    })
 }
 
 /// The keys of a section within `[task]` if it is the task's own. A setting that the task does not read would look as if it
@@ -222,13 +216,9 @@ impl TaskConfig {
         self
     }
 
-    fn definition(&self) -> &'static Definition {
+    /// What the task says about itself, whatever its size.
+    pub fn definition(&self) -> &'static Definition {
         self.name.definition()
-    }
-
-    /// Name for people.
-    pub fn title(&self) -> &'static str {
-        self.definition().title
     }
 
     /// D: space dimensions of positions.
@@ -244,21 +234,6 @@ impl TaskConfig {
     /// X: further numbers of an agent's state that an agent sees and the wire carries.
     pub fn agent_state(&self) -> usize {
         self.definition().agent_state
-    }
-
-    /// Whether agents can crash and then are out of the episode.
-    pub fn crashes(&self) -> bool {
-        self.definition().crashes
-    }
-
-    /// Radius that a landmark is drawn with, world units.
-    pub fn landmark_radius(&self) -> f32 {
-        self.definition().landmark_radius
-    }
-
-    /// Seconds per joint step.
-    pub fn step_seconds(&self) -> f32 {
-        self.definition().step_seconds
     }
 
     /// Choices of each action component.
@@ -335,7 +310,7 @@ impl Metric {
     pub fn applies(&self, task: &TaskConfig) -> bool {
         match self.scope {
             Scope::EveryTask => true,
-            Scope::Crashes => task.crashes(),
+            Scope::Crashes => task.definition().crashes,
             Scope::SecondStage => task.stages().len() > 1,
         }
     }

@@ -20,7 +20,6 @@ pub(crate) fn read<T: DeserializeOwned>(section: &str, table: Table) -> Result<T
     })
 }
 
-/// The name of a key of a section.
 pub(crate) fn dotted(section: &str, key: &str) -> String {
     if section.is_empty() { key.to_owned() } else { format!("{section}.{key}") }
 }

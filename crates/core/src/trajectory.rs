@@ -1,6 +1,6 @@
 //! What comes back from a shard: a trajectory to train on, or the metrics of evaluation episodes.
 
-use crate::error::FieldError;
+use crate::error::{FieldError, check_count, check_finite};
 use crate::ids::Shard;
 use crate::metrics_table::METRICS;
 use crate::statics::Statics;
@@ -170,9 +170,7 @@ impl Trajectory {
         ];
         for (name, data, expected) in floats {
             check_count(name, "numbers", data.len(), expected)?;
-            if let Some(place) = data.iter().position(|x| !x.is_finite()) {
-                return Err(FieldError::new(format!("{name}[{place}]"), format!("{} is not finite", data[place])));
-            }
+            check_finite(name, data)?;
         }
         self.statics.check_numbers(b)?;
         if let Some(place) = self.log_probs.iter().position(|&x| x > 1e-4) {
@@ -188,11 +186,4 @@ impl Trajectory {
         check_count("actions", "entries", self.actions.len(), t * b * n * s.action_components)?;
         check_count("metrics", "entries", self.metrics.len(), b)
     }
-}
-
-fn check_count(field: &str, what: &str, found: usize, expected: usize) -> Result<(), FieldError> {
-    if found == expected {
-        return Ok(());
-    }
-    Err(FieldError::new(field, format!("{found} {what}, the shape asks for {expected}")))
 }

@@ -1,11 +1,9 @@
 //! Drones (paper, section 5.1.2): Crazyflie 2.X quadrotors with the dynamics and the controller of gym-pybullet-drones
-//! 2.1.0, integrated by rapier.
-//!
-//! Units are SI, z is up, quaternions are `[x, y, z, w]` and turn body vectors into world vectors; velocities and
+//! 2.1.0, integrated by rapier. Units are SI, z is up, quaternions are `[x, y, z, w]` and turn body vectors into world vectors; velocities and
 //! angular velocities are in the world frame. Motors 0..3 are front right, rear right, rear left, front left.
 //!
 //! The authors' own environment for this task is not published: its physics is (the simulator's), spawn, success radius,
-//! reward and the handling of crashes are this crate's, see [`Drones`].
+//! reward and the handling of crashes are this crate's, see [`Flight`].
 
 mod constants;
 pub mod control;
@@ -16,20 +14,19 @@ pub mod world;
 mod engine;
 mod episode;
 
-use crate::error::EnvError;
 use crate::particles::placement::uniform;
-use crate::shell::{Moment, Rules, Shell, Starts, Task};
+use crate::rules::{Rules, Score, Starts};
 use episode::Episode;
+use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::statics::LANDMARKS;
 use magex_core::task::{DroneConfig, TaskConfig};
-use magex_core::trajectory::EpisodeMetrics;
 use model::{Craft, Effects};
-use world::Laws;
+use world::{Drone, Laws};
 
 pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 
-/// B episodes of N drones and N landmarks, stepped together.
+/// The rules of B episodes of N drones and N landmarks.
 ///
 /// Positions, velocities and landmarks are `[B, N, 3]` in m and m/s, goals `[B, N]`, actions `[B, N, 3]`, rewards
 /// `[B, N]`; agent_state `[B, N, 6]` are the target velocity, x and y of the body's up axis, and 1 for a drone that is out.
@@ -48,51 +45,12 @@ pub use constants::{ACCELERATION, COVER_RADIUS, HEIGHT, MOST_SPEED};
 /// * **Score.** Success: share of landmarks with a drone that is not out within 0.15 m. Collision rate: share of drones
 ///   that are out; collisions per agent and step: the same divided by the commands.
 ///
-/// Drag and ground effect are those of the reference. Its downwash ([`Craft::downwash`]) is singular: two drones at
-/// almost equal height, as all are here, press each other down with 1 / Δz². Side by side at 0.3 m, the least distance of
-/// the spawn, a drone 5 mm lower is pushed down with 263 times its weight and is shot into the ground (a test measures
-/// it). So the default bounds the force of one upper drone by m g, its thrust in hover: a wash carries no more momentum
-/// than the thrust that makes it.
+/// Drag and ground effect are those of the reference. Its downwash ([`Craft::downwash`]) is singular: side by side at 0.3 m,
+/// the least distance of the spawn, a drone 5 mm lower is pushed down with 263 times its weight and is shot into the ground
+/// (a test measures it). So the default bounds the force of one upper drone by m g, its thrust in hover: a wash carries no
+/// more momentum than the thrust that makes it.
 ///
 /// Positions that are given with velocities of more than 2 m/s do not keep them: they are the first target velocities.
-pub type Drones = Shell<DroneTask>;
-
-/// The drone task as the [`Shell`] sees it.
-#[derive(Debug)]
-pub enum DroneTask {}
-
-impl Task for DroneTask {
-    type Rules = Flight;
-
-    fn start(task: &TaskConfig, _: bool, stream: &mut Stream, starts: &mut Starts) -> Result<(), EnvError> {
-        let spacing = f64::from(task.drones()?.spacing);
-        let mut draw = || -> Vec<f32> {
-            let flat = uniform(task.agents, task.side, spacing, stream);
-            flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]).collect()
-        };
-        starts.positions.extend(draw());
-        starts.extend(LANDMARKS, &draw());
-        Ok(())
-    }
-
-    fn rules(task: &TaskConfig, starts: &Starts) -> Result<Box<Flight>, EnvError> {
-        let (n, config) = (3 * task.agents, *task.drones()?);
-        let landmarks = starts.statics.get(LANDMARKS);
-        let effects = Effects { ground: true, drag: true, downwash: true };
-        let dt = 1.0 / f64::from(config.physics_hz);
-        let states = starts.positions.chunks_exact(n).zip(starts.velocities.chunks_exact(n));
-        Ok(Box::new(Flight {
-            laws: Laws::new(Craft::CF2X, effects, config.downwash, dt),
-            config,
-            agents: task.agents,
-            hold: config.physics_hz / DroneConfig::COMMANDS_HZ,
-            episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities)).collect(),
-            landmarks: landmarks.to_vec(),
-        }))
-    }
-}
-
-/// The rules of the drone task.
 pub struct Flight {
     laws: Laws,
     config: DroneConfig,
@@ -104,8 +62,39 @@ pub struct Flight {
     landmarks: Vec<f32>,
 }
 
+/// Draws the start of one episode.
+pub(crate) fn start(task: &TaskConfig, stream: &mut Stream, starts: &mut Starts) -> Result<(), FieldError> {
+    let spacing = f64::from(task.drones()?.spacing);
+    let mut draw = || -> Vec<f32> {
+        let flat = uniform(task.agents, task.side, spacing, stream);
+        flat.chunks_exact(2).flat_map(|xy| [xy[0], xy[1], HEIGHT]).collect()
+    };
+    starts.positions.extend(draw());
+    starts.extend(LANDMARKS, &draw());
+    Ok(())
+}
+
 impl Flight {
-    /// Landmarks [N, 3] of an episode.
+    /// The rules of episodes that start there.
+    pub(crate) fn new(task: &TaskConfig, starts: &Starts) -> Result<Self, FieldError> {
+        let (n, config) = (3 * task.agents, *task.drones()?);
+        let effects = Effects { ground: true, drag: true, downwash: true };
+        let dt = 1.0 / f64::from(config.physics_hz);
+        let states = starts.positions.chunks_exact(n).zip(starts.velocities.chunks_exact(n));
+        Ok(Self {
+            laws: Laws::new(Craft::CF2X, effects, config.downwash, dt),
+            config,
+            agents: task.agents,
+            hold: config.physics_hz / DroneConfig::COMMANDS_HZ,
+            episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities)).collect(),
+            landmarks: starts.landmarks().to_vec(),
+        })
+    }
+
+    fn drones(&self) -> impl Iterator<Item = &Drone> {
+        self.episodes.iter().flat_map(|episode| &episode.world.drones)
+    }
+
     fn landmarks(&self, episode: usize) -> &[f32] {
         &self.landmarks[3 * self.agents * episode..3 * self.agents * (episode + 1)]
     }
@@ -125,15 +114,13 @@ impl Rules for Flight {
     }
 
     fn write_positions(&self, out: &mut [f32]) {
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+        for (out, drone) in out.chunks_exact_mut(3).zip(self.drones()) {
             out.copy_from_slice(&drone.motion.pose.translation.to_array());
         }
     }
 
     fn write_velocities(&self, out: &mut [f32]) {
-        let drones = self.episodes.iter().flat_map(|episode| &episode.world.drones);
-        for (out, drone) in out.chunks_exact_mut(3).zip(drones) {
+        for (out, drone) in out.chunks_exact_mut(3).zip(self.drones()) {
             out.copy_from_slice(&drone.motion.linvel.to_array());
         }
     }
@@ -145,12 +132,12 @@ impl Rules for Flight {
         }
     }
 
-    fn success(&self, episode: usize) -> f32 {
-        self.episodes[episode].success(self.landmarks(episode))
+    fn covered(&self, episode: usize) -> usize {
+        self.episodes[episode].covered(self.landmarks(episode))
     }
 
-    fn score(&self, episode: usize, moment: &Moment<'_>) -> EpisodeMetrics {
-        self.episodes[episode].score(moment, self.landmarks(episode))
+    fn score(&self, episode: usize, commands: f64, _: &[u32]) -> Score {
+        self.episodes[episode].score(commands, self.landmarks(episode))
     }
 }
 

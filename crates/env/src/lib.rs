@@ -15,21 +15,18 @@
 pub mod controller;
 pub mod drones;
 pub mod particles;
-pub mod push_ball;
-pub mod shell;
 pub mod spread;
 
 mod env;
-mod error;
 mod matching;
+mod push_ball;
+mod rules;
 mod tasks;
 
 pub use controller::Controller;
-pub use drones::Drones;
 pub use env::Env;
-pub use error::EnvError;
 pub use particles::constants::CONTACT_DISTANCE;
 pub use particles::real::Real;
-pub use push_ball::PushBall;
-pub use spread::{COVER_RADIUS, Spread, layouts, start as spawn};
-pub use tasks::{new_env, scripted};
+pub use rules::{Rules, Score};
+pub use spread::start as spawn;
+pub use tasks::{env_from_state, new_env, scripted};

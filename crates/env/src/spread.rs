@@ -1,47 +1,36 @@
-//! Simple Spread (paper, section 5.1.1): its worlds, their starts and their reward.
+//! Simple Spread (paper, section 5.1.1): its starts and its reward. Positions, velocities and landmarks are `[B, N, 2]` in
+//! world units (and per second), goals, actions and rewards `[B, N]`.
 
-pub(crate) mod batch;
-pub mod layouts;
+pub(crate) mod layouts;
 pub mod start;
 
-use crate::error::EnvError;
+mod objective;
+
+use crate::particles::batch::Batch;
 use crate::particles::constants::{LANES, share_registers};
-use crate::shell::{Rules, Shell, Starts, Task};
-use batch::Batch;
+use crate::rules::{Rules, Starts};
+use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::statics::LANDMARKS;
 use magex_core::task::TaskConfig;
+use objective::SpreadObjective;
 
-pub use batch::COVER_RADIUS;
+pub use objective::COVER_RADIUS;
 
-/// B episodes of Simple Spread with N agents and N landmarks, stepped together.
-///
-/// Positions, velocities and landmarks are `[B, N, 2]` in world units (and per second), goals, actions and rewards `[B, N]`.
-pub type Spread = Shell<SpreadTask>;
+/// Draws the start of one episode.
+pub(crate) fn start(task: &TaskConfig, stream: &mut Stream, starts: &mut Starts) {
+    let start = start::spawn(task, stream);
+    starts.positions.extend_from_slice(&start.agents);
+    starts.extend(LANDMARKS, &start.landmarks);
+}
 
-/// Simple Spread as the [`Shell`] sees it.
-#[derive(Debug)]
-pub enum SpreadTask {}
-
-impl Task for SpreadTask {
-    type Rules = dyn Rules;
-
-    fn start(task: &TaskConfig, _: bool, stream: &mut Stream, starts: &mut Starts) -> Result<(), EnvError> {
-        let start = start::spawn(task, stream);
-        starts.positions.extend_from_slice(&start.agents);
-        starts.extend(LANDMARKS, &start.landmarks);
-        Ok(())
-    }
-
-    fn rules(task: &TaskConfig, starts: &Starts) -> Result<Box<dyn Rules>, EnvError> {
-        let (positions, velocities, landmarks) =
-            (&starts.positions, &starts.velocities, starts.statics.get(LANDMARKS).to_vec());
-        Ok(if share_registers(task.agents, landmarks.len() / (2 * task.agents)) {
-            Box::new(Batch::<f32, LANES>::new(task, positions, velocities, landmarks, false)?)
-        } else {
-            Box::new(Batch::<f32, 1>::new(task, positions, velocities, landmarks, true)?)
-        })
-    }
+/// The rules of episodes that start there.
+pub(crate) fn rules(task: &TaskConfig, starts: &Starts) -> Result<Box<dyn Rules>, FieldError> {
+    Ok(if share_registers(task.agents, starts.landmarks().len() / (2 * task.agents)) {
+        Box::new(Batch::<LANES, SpreadObjective<LANES>>::new(task, starts, false)?)
+    } else {
+        Box::new(Batch::<1, SpreadObjective<1>>::new(task, starts, true)?)
+    })
 }
 
 #[cfg(test)]

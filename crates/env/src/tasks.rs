@@ -1,25 +1,56 @@
 //! The list of tasks.
 
 use crate::controller::{Controller, DroneScript, PushBallScript, SpreadScript};
-use crate::drones::Drones;
 use crate::env::Env;
-use crate::error::EnvError;
-use crate::push_ball::PushBall;
-use crate::spread::Spread;
+use crate::rules::{Rules, Starts};
+use crate::{drones, push_ball, spread};
+use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::task::{TaskConfig, TaskName};
 
-/// Episodes of a task, one per stream. In training, starts that help learning may be mixed in.
-pub fn new_env(
+/// Episodes of a task, one per stream, started as the task says. In training, starts that help learning may be mixed in. An
+/// error if the task does not validate.
+pub fn new_env(task: &TaskConfig, streams: impl Iterator<Item = Stream>, training: bool) -> Result<Env, FieldError> {
+    assemble(task, starts(task, streams, training)?)
+}
+
+/// Where these episodes start.
+pub(crate) fn starts(
     task: &TaskConfig,
     streams: impl Iterator<Item = Stream>,
     training: bool,
-) -> Result<Box<dyn Env>, EnvError> {
-    Ok(match task.name {
-        TaskName::SimpleSpread => Box::new(Spread::new(task, streams, training)?),
-        TaskName::PushBall => Box::new(PushBall::new(task, streams, training)?),
-        TaskName::Drones => Box::new(Drones::new(task, streams, training)?),
-    })
+) -> Result<Starts, FieldError> {
+    task.validate()?;
+    let mut starts = Starts::none(task);
+    for mut stream in streams {
+        match task.name {
+            TaskName::SimpleSpread => spread::start(task, &mut stream, &mut starts),
+            TaskName::PushBall => push_ball::start(task, training, &mut stream, &mut starts)?,
+            TaskName::Drones => drones::start(task, &mut stream, &mut starts)?,
+        }
+    }
+    starts.velocities = vec![0.0; starts.positions.len()];
+    Ok(starts)
+}
+
+/// Episodes of a task without other static arrays that start from given positions and velocities [B, E, D] and landmarks
+/// [B, N, D].
+pub fn env_from_state(
+    task: &TaskConfig,
+    positions: &[f32],
+    velocities: &[f32],
+    landmarks: &[f32],
+) -> Result<Env, FieldError> {
+    assemble(task, Starts::given(task, [positions, velocities, landmarks])?)
+}
+
+fn assemble(task: &TaskConfig, starts: Starts) -> Result<Env, FieldError> {
+    let rules: Box<dyn Rules> = match task.name {
+        TaskName::SimpleSpread => spread::rules(task, &starts)?,
+        TaskName::PushBall => push_ball::rules(task, &starts)?,
+        TaskName::Drones => Box::new(drones::Flight::new(task, &starts)?),
+    };
+    Ok(Env::new(task, starts, rules))
 }
 
 /// The scripted controller of a task: a yardstick.

@@ -11,18 +11,18 @@ use assign::exact;
 use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{MATCHED_SUCCESS_RATE, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
-use magex_core::statics::Statics;
+use magex_core::statics::{LANDMARKS, Statics};
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_env::controller::PushBallScript;
-use magex_env::{Controller as _, Env as _, PushBall};
+use magex_env::{Controller as _, new_env};
 
 fn play(task: &TaskConfig, episodes: u32) -> Vec<EpisodeMetrics> {
     let n = task.agents;
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
-    let mut env = PushBall::new(task, streams, false).unwrap();
+    let mut env = new_env(task, streams, false).unwrap();
     let statics = env.statics().clone();
-    let landmarks = env.landmarks();
+    let landmarks = env.statics().get(LANDMARKS);
     let mut script = PushBallScript::new(n);
     let (mut positions, mut velocities) = (env.positions(), env.velocities());
     let mut goals = Vec::new();
@@ -82,7 +82,7 @@ fn the_choice_depends_on_the_state_alone() {
     // Three states of two episodes in one call, or one by one: the same actions.
     let task = TaskConfig::of(TaskName::PushBall, 5, Spawn::Uniform);
     let streams = (0..2).map(|episode| Key::new(9, Purpose::EvalSpawn, &[2, episode]).stream());
-    let mut env = PushBall::new(&task, streams, false).unwrap();
+    let mut env = new_env(&task, streams, false).unwrap();
     let goals: Vec<u32> = (0..2).flat_map(|_| (0..5).flat_map(|i| [i, 4 - i])).collect();
     env.set_goals(&goals).unwrap();
     let statics = env.statics().clone();
@@ -121,7 +121,7 @@ fn the_choice_depends_on_the_state_alone() {
     wrong[3] = 5;
     let error = script.act(&JointState { goals: &wrong, ..state }, &mut together).unwrap_err().to_string();
     assert!(error.contains("goals[3]") && error.contains("landmark"), "{error}");
-    let short = Statics::landmarks(5, 2, env.landmarks()[1..].to_vec());
+    let short = Statics::landmarks(5, 2, env.statics().get(LANDMARKS)[1..].to_vec());
     for (state, field) in [
         (JointState { positions: &positions[1..], ..state }, "positions"),
         (JointState { velocities: &velocities[1..], ..state }, "velocities"),

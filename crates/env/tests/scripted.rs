@@ -11,10 +11,11 @@ use assign::exact;
 use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{ARRIVAL_STEP, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
+use magex_core::statics::LANDMARKS;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_env::controller::SpreadScript;
-use magex_env::{Controller as _, Env as _, Spread};
+use magex_env::{Controller as _, new_env};
 
 fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> {
     let worlds = positions.chunks_exact(2 * agents).zip(landmarks.chunks_exact(2 * agents));
@@ -24,9 +25,9 @@ fn exact_goals(positions: &[f32], landmarks: &[f32], agents: usize) -> Vec<u32> 
 fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
     let task = TaskConfig::simple_spread(agents, spawn);
     let streams = (0..episodes).map(|episode| Key::new(9, Purpose::EvalSpawn, &[1, episode]).stream());
-    let mut spread = Spread::new(&task, streams, false).unwrap();
+    let mut spread = new_env(&task, streams, false).unwrap();
     let statics = spread.statics().clone();
-    let goals = exact_goals(&spread.positions(), spread.landmarks(), agents);
+    let goals = exact_goals(&spread.positions(), spread.statics().get(LANDMARKS), agents);
     spread.set_goals(&goals).unwrap();
     let (mut positions, mut velocities) = (spread.positions(), spread.velocities());
     let mut actions = vec![0; goals.len()];

@@ -5,7 +5,7 @@ use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use magex_viewer::curve::{curve_svg, parse_metrics};
-use magex_viewer::replay::{ReplayEpisode, ReplayInfo, replay_html};
+use magex_viewer::replay::replay_html;
 use std::path::Path;
 
 /// Task, executor, scheduler and seed of a run on one line.
@@ -13,7 +13,7 @@ pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
     format!(
         "{}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
-        task.title(),
+        task.definition().title,
         task.agents,
         task.spawn,
         config.executor.kind,
@@ -36,17 +36,7 @@ pub(crate) fn write_replay(
     config: &RunConfig,
     episodes: &[(Recording, Option<EpisodeMetrics>)],
 ) -> anyhow::Result<()> {
-    let info = ReplayInfo::of(&config.task, title, subtitle);
-    let named: Vec<ReplayEpisode<'_>> = episodes
-        .iter()
-        .enumerate()
-        .map(|(k, (recording, metrics))| ReplayEpisode {
-            name: format!("episode {}", k + 1),
-            recording,
-            metrics: *metrics,
-        })
-        .collect();
-    write(path, replay_html(&info, &named)?.as_bytes())
+    write(path, replay_html(&config.task, title, subtitle, episodes)?.as_bytes())
 }
 
 /// Writes `replay.html` from the recordings in the run folder.

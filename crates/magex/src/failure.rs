@@ -70,6 +70,6 @@ mod tests {
         assert_eq!(code_of(&error), exit::USAGE);
         assert_eq!(format!("{error:#}"), "reading the configuration: agents: 0 is too few");
         assert_eq!(code_of(&anyhow::anyhow!("broken")), exit::FAILURE);
-        assert_eq!(code_of(&ConfigError::Syntax("x".into()).into()), exit::USAGE);
+        assert_eq!(code_of(&ConfigError("x".into()).into()), exit::USAGE);
     }
 }

@@ -80,7 +80,6 @@ pub struct Decision {
     pub probabilities: Vec<f32>,
 }
 
-/// A network that scores instances.
 enum Net {
     Pairwise(PairwiseNet),
     Ranking(RankingNet),
@@ -186,12 +185,12 @@ impl Commander {
 
     /// [2, P] log-probabilities and entropies of all picks of given decisions, differentiable in the network's weights.
     pub fn pick_log_probs(&self, instances: &[Instance], picks: &[Vec<Pick>]) -> Result<Tensor, CommanderError> {
-        let mut start = 0;
-        let mut tables = Vec::with_capacity(instances.len());
-        for (instance, picks) in instances.iter().zip(picks) {
-            tables.push(PickTable { start, columns: instance.columns, picks: picks.clone() });
-            start += instance.rows * instance.columns;
-        }
-        Ok(pick_log_probs(&self.scores(instances)?, Arc::new(tables))?)
+        let mut end = 0;
+        let tables = instances.iter().zip(picks).map(|(instance, picks)| {
+            let start = end;
+            end += instance.cells();
+            PickTable { start, columns: instance.columns, picks: picks.clone() }
+        });
+        Ok(pick_log_probs(&self.scores(instances)?, Arc::new(tables.collect()))?)
     }
 }

@@ -57,15 +57,11 @@ impl ActionHeads {
                 Some(stream) => {
                     let u = stream.uniform32();
                     let mut sum = 0.0;
-                    let mut pick = size - 1;
-                    for (i, x) in log_probs.iter().enumerate() {
+                    let mut beyond = |x: &f32| {
                         sum += libm::expf(*x);
-                        if u < sum {
-                            pick = i;
-                            break;
-                        }
-                    }
-                    pick
+                        u < sum
+                    };
+                    log_probs.iter().position(&mut beyond).unwrap_or(size - 1)
                 }
             };
             total += log_probs[pick];

@@ -17,17 +17,17 @@ mod policy;
 mod team;
 
 use crate::features::{FeatureSpec, Features};
-use crate::ops::{Activation, GraphNoise, linear};
+use crate::ops::{Activation, GraphNoise, linear, neighbour_pool};
 use crate::params::{Init, ParamBuilder, ParamError};
-use candle_core::{Result as CandleResult, Tensor};
+use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
+use local::LocalNet;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
+use team::TeamNet;
 
-pub use local::LocalNet;
 pub use model::{Model, Part};
-pub use policy::{Acted, Chooser, Evaluated, Independent, Policy};
-pub use team::TeamNet;
+pub use policy::{Chooser, Evaluated, Independent, Policy};
 
 /// What a network sees: L steps of C sequences of N agents, rows ordered [L, C, N].
 #[derive(Debug)]
@@ -70,22 +70,20 @@ pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
 }
 
 /// Builds an actor or critic with `outputs` outputs; `head_gain` is the orthogonal gain of the last layer
-/// (0.01 for actors, 1 for critics). `agents` matters to `mlp` only.
+/// (0.01 for actors, 1 for critics).
 pub fn build(
     config: &ExecutorConfig,
     spec: &FeatureSpec,
-    agents: usize,
     outputs: usize,
     head_gain: f64,
     params: &mut ParamBuilder,
 ) -> Result<Box<dyn Network>, ParamError> {
     Ok(match config.kind {
         ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, params)?),
-        _ => Box::new(TeamNet::build(config, spec, agents, outputs, head_gain, params)?),
+        _ => Box::new(TeamNet::build(config, spec, outputs, head_gain, params)?),
     })
 }
 
-/// A fully connected layer.
 pub(crate) struct Layer {
     w: Tensor,
     b: Tensor,
@@ -118,6 +116,29 @@ impl Layer {
 impl Module for Layer {
     fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
         linear(x, &self.w, &self.b, self.act, self.constant_input)
+    }
+}
+
+/// Σ over an agent's nearest neighbours of relu(neighbour → units).
+struct NeighbourEncoder {
+    w: Tensor,
+    b: Tensor,
+    neighbours: usize,
+    width: usize,
+}
+
+impl NeighbourEncoder {
+    fn build(params: &mut ParamBuilder, name: &str, spec: &FeatureSpec, units: usize) -> Result<Self, ParamError> {
+        let (neighbours, width) = (spec.neighbours, spec.neighbour_width());
+        let w = params.tensor(&format!("{name}.weight"), &[width, units], Init::Orthogonal(RELU_GAIN))?;
+        let b = params.tensor(&format!("{name}.bias"), &[units], Init::Constant(0.0))?;
+        Ok(Self { w, b, neighbours, width })
+    }
+
+    fn forward(&self, features: &Features) -> CandleResult<Tensor> {
+        let shape = (features.counts.len(), self.neighbours, self.width);
+        let neighbours = Tensor::from_slice(&features.neighbours, shape, &Device::Cpu)?;
+        neighbour_pool(&neighbours, features.counts.clone(), &self.w, &self.b)
     }
 }
 

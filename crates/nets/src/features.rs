@@ -13,24 +13,15 @@ mod symmetry;
 
 use magex_core::joint_state::JointState;
 use magex_core::task::{Frame, Observation, TaskConfig};
+use magex_core::trajectory::Shape;
 
 pub use symmetry::Symmetry;
 
 /// What a network wants to see.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FeatureSpec {
-    /// N.
-    pub agents: usize,
-    /// Moving bodies that are not agents.
-    pub balls: usize,
-    /// G: landmarks.
-    pub landmarks: usize,
-    /// D: 2 or 3.
-    pub dims: usize,
-    /// X: further numbers of an agent's state.
-    pub agent_state: usize,
-    /// K: targets per agent.
-    pub goals_per_agent: usize,
+    /// Sizes of a joint state; steps and episodes are of no account.
+    pub shape: Shape,
     /// Half side of the map: the unit of absolute positions.
     pub half_side: f32,
     /// Goal positions relative to the agent (ours), or absolute (literal reading of the paper).
@@ -65,12 +56,7 @@ impl FeatureSpec {
     pub fn new(task: &TaskConfig, relative_goal: bool, neighbours: usize, team: bool) -> Self {
         let observation = task.observation();
         Self {
-            agents: task.agents,
-            balls: task.balls(),
-            landmarks: task.agents,
-            dims: task.dims(),
-            agent_state: task.agent_state(),
-            goals_per_agent: task.stages().len(),
+            shape: task.shape(1),
             half_side: task.side / 2.0,
             relative_goal,
             neighbours,
@@ -82,35 +68,30 @@ impl FeatureSpec {
 
     /// Width of a node's features.
     pub fn node_width(&self) -> usize {
-        2 * self.dims + self.agent_state + if self.pushes() { self.dims } else { 0 }
+        2 * self.shape.dims + self.shape.agent_state + if self.pushes() { self.shape.dims } else { 0 }
     }
 
     /// Width of an agent's goal features.
     pub fn goal_width(&self) -> usize {
-        self.agent_state
+        self.shape.agent_state
             + match (self.relative_goal, self.pushes()) {
-                (false, _) => (2 + self.goals_per_agent) * self.dims,
-                (true, false) => self.dims + self.goals_per_agent * (2 * self.dims + 1),
-                (true, true) => push::width(self.dims),
+                (false, _) => (2 + self.shape.goals_per_agent) * self.shape.dims,
+                (true, false) => self.shape.dims + self.shape.goals_per_agent * (2 * self.shape.dims + 1),
+                (true, true) => push::width(self.shape.dims),
             }
     }
 
     /// Width of one neighbour's features.
     pub fn neighbour_width(&self) -> usize {
-        let approach = if self.observation.encounters { self.dims + 2 } else { 0 };
-        2 * self.dims + 1 + approach + usize::from(self.balls > 0)
-    }
-
-    /// E.
-    fn bodies(&self) -> usize {
-        self.agents + self.balls
+        let approach = if self.observation.encounters { self.shape.dims + 2 } else { 0 };
+        2 * self.shape.dims + 1 + approach + usize::from(self.shape.bodies > self.shape.agents)
     }
 
     /// Features of all agents of all states.
     pub fn compute(&self, states: &JointState<'_>) -> Features {
-        let (n, d, joint) = (self.agents, self.dims, self.bodies() * self.dims);
+        let (n, d, joint) = (self.shape.agents, self.shape.dims, self.shape.bodies * self.shape.dims);
         let (count, landmarks) = (states.positions.len() / joint, states.landmarks());
-        let episodes = states.goals.len() / (n * self.goals_per_agent);
+        let episodes = states.goals.len() / (n * self.shape.goals_per_agent);
         let mut out = Features::default();
         out.goals.reserve(count * n * self.goal_width());
         if self.neighbours > 0 {
@@ -127,12 +108,13 @@ impl FeatureSpec {
             let state = State {
                 p: &states.positions[s * joint..(s + 1) * joint],
                 v: &states.velocities[s * joint..(s + 1) * joint],
-                agent_state: &states.agent_state[s * n * self.agent_state..(s + 1) * n * self.agent_state],
-                landmarks: &landmarks[episode * self.landmarks * d..(episode + 1) * self.landmarks * d],
-                goals: &states.goals[episode * n * self.goals_per_agent..(episode + 1) * n * self.goals_per_agent],
+                agent_state: &states.agent_state[s * n * self.shape.agent_state..(s + 1) * n * self.shape.agent_state],
+                landmarks: &landmarks[episode * self.shape.landmarks * d..(episode + 1) * self.shape.landmarks * d],
+                goals: &states.goals
+                    [episode * n * self.shape.goals_per_agent..(episode + 1) * n * self.shape.goals_per_agent],
                 dims: d,
                 agents: n,
-                goals_per_agent: self.goals_per_agent,
+                goals_per_agent: self.shape.goals_per_agent,
             };
             symmetries.clear();
             symmetries.extend((0..n).map(|i| self.symmetry(&state, i)));
@@ -162,7 +144,7 @@ impl FeatureSpec {
     /// What the graph is made of, along the axes of the world: all agents of a state must see the same space.
     fn team_features(&self, state: &State<'_>, out: &mut Features) {
         let (p_scale, v_scale) = (1.0 / self.half_side, 1.0 / self.observation.speed);
-        for i in 0..self.agents {
+        for i in 0..self.shape.agents {
             let (p, v) = (state.position(i), state.velocity(i));
             out.nodes.extend(p.iter().map(|x| x * p_scale));
             out.nodes.extend(v.iter().map(|x| x * v_scale));

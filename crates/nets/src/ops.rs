@@ -11,6 +11,7 @@ mod gru;
 mod linear;
 mod matmul;
 mod norm;
+mod operation;
 mod picks;
 mod pool;
 mod simd;
@@ -27,7 +28,7 @@ pub use picks::{Pick, PickTable, pick_log_probs};
 pub use pool::{mean_of_others, neighbour_pool};
 pub(crate) use simd::{LANES, load};
 
-use candle_core::{CpuStorage, Device, Layout, Result, Tensor, bail};
+use candle_core::{Device, Result, Tensor};
 
 /// A tensor [rows, width] of numbers that need no gradient.
 pub fn constant(values: impl Into<Vec<f32>>, width: usize) -> Result<Tensor> {
@@ -36,30 +37,8 @@ pub fn constant(values: impl Into<Vec<f32>>, width: usize) -> Result<Tensor> {
     Tensor::from_vec(values, (rows, width), &Device::Cpu)
 }
 
-/// The contiguous f32 slice behind a custom operation's argument.
-fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
-    match layout.contiguous_offsets() {
-        Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
-        None => bail!("custom operations need contiguous tensors"),
-    }
-}
-
-/// Copies a tensor's values out, in row-major order.
-fn values(tensor: &Tensor) -> Result<Vec<f32>> {
-    tensor.flatten_all()?.to_vec1::<f32>()
-}
-
 /// Lends a contiguous CPU tensor's values.
 pub fn with_values<T>(tensor: &Tensor, f: impl FnOnce(&[f32]) -> T) -> Result<T> {
     let (storage, layout) = tensor.storage_and_layout();
-    match &*storage {
-        candle_core::Storage::Cpu(storage) => Ok(f(slice(storage, layout)?)),
-        _ => bail!("the tensor is not on the CPU"),
-    }
-}
-
-/// Rows of a tensor seen as [rows, last dimension].
-fn rows(layout: &Layout) -> usize {
-    let dims = layout.shape().dims();
-    dims[..dims.len().saturating_sub(1)].iter().product()
+    Ok(f(operation::Arg::lent(&storage, layout)?.values))
 }

@@ -5,6 +5,7 @@ use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result as CandleResult, Tensor, Var};
 use magex_core::rng::Stream;
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// Why parameters could not be built, written or read.
 #[derive(Debug, thiserror::Error)]
@@ -43,14 +44,9 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Count of values.
-    pub fn len(&self) -> usize {
-        self.shape.iter().product()
-    }
-
-    /// Whether the tensor has no values.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
+    /// Its place in [`Params::values`].
+    pub fn range(&self) -> Range<usize> {
+        self.start..self.start + self.shape.iter().product::<usize>()
     }
 }
 
@@ -97,7 +93,7 @@ impl ParamBuilder {
             },
         };
         let entry = Entry { name: name.to_owned(), shape: shape.to_vec(), init, start: self.count };
-        self.count += entry.len();
+        self.count = entry.range().end;
         self.entries.push(entry);
         Ok(tensor)
     }
@@ -114,7 +110,7 @@ impl Params {
         let mut values = Vec::new();
         for entry in &entries {
             match entry.init {
-                Init::Constant(value) => values.resize(values.len() + entry.len(), value),
+                Init::Constant(value) => values.resize(entry.range().end, value),
                 Init::Orthogonal(gain) => values.extend(orthogonal(&entry.shape, gain, &mut stream)),
             }
         }
@@ -149,10 +145,8 @@ impl Params {
 
     /// Constant tensors: a forward pass on them records no graph.
     pub fn tensors(&self) -> CandleResult<Vec<Tensor>> {
-        self.entries
-            .iter()
-            .map(|e| Tensor::from_slice(&self.values[e.start..e.start + e.len()], e.shape.as_slice(), &Device::Cpu))
-            .collect()
+        let tensor = |e: &Entry| Tensor::from_slice(&self.values[e.range()], e.shape.as_slice(), &Device::Cpu);
+        self.entries.iter().map(tensor).collect()
     }
 
     /// Variables: a forward pass on them can be differentiated. They own a copy of the values, which is cheap at the size of
@@ -180,8 +174,7 @@ pub fn to_safetensors(networks: &[(&str, &Params)], note: &str) -> Result<Vec<u8
     let mut tensors = Vec::new();
     for (prefix, params) in networks {
         for entry in &params.entries {
-            let values = &params.values[entry.start..entry.start + entry.len()];
-            let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+            let bytes: Vec<u8> = params.values[entry.range()].iter().flat_map(|x| x.to_le_bytes()).collect();
             tensors.push((format!("{prefix}.{}", entry.name), entry.shape.clone(), bytes));
         }
     }
@@ -215,14 +208,8 @@ fn orthogonal(shape: &[usize], gain: f64, stream: &mut Stream) -> Vec<f32> {
             basis.push(v);
         }
     }
-    let mut out = Vec::with_capacity(rows * columns);
-    for i in 0..rows {
-        for j in 0..columns {
-            let value = if rows <= columns { basis[i][j] } else { basis[j][i] };
-            out.push((gain * value) as f32);
-        }
-    }
-    out
+    let value = |i: usize, j: usize| if rows <= columns { basis[i][j] } else { basis[j][i] };
+    (0..rows * columns).map(|k| (gain * value(k / columns, k % columns)) as f32).collect()
 }
 
 #[cfg(test)]

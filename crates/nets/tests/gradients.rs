@@ -76,7 +76,7 @@ fn recurrent_unit() {
 #[test]
 fn neighbour_pool() {
     let features = Tensor::from_vec(normal(5 * 3 * 4, 1), (5, 3, 4), &Device::Cpu).unwrap();
-    let counts = Arc::new(vec![3, 0, 1, 2, 3]);
+    let counts = vec![3, 0, 1, 2, 3];
     let (w, b) = (var(&[4, 20], 2), var(&[20], 3));
     check(&[&w, &b], &|| ops::neighbour_pool(&features, counts.clone(), &w, &b).unwrap());
 }
@@ -235,7 +235,7 @@ fn drawn(name: TaskName, kind: ExecutorKind, agents: usize, outputs: usize) -> (
     let config = ExecutorConfig { kind, neighbours: 3, ..ExecutorConfig::default() };
     let task = TaskConfig::of(name, agents, Spawn::Uniform);
     let mut params = ParamBuilder::layout();
-    build(&config, &feature_spec(&config, &task), agents, outputs, 1.0, &mut params).unwrap();
+    build(&config, &feature_spec(&config, &task), outputs, 1.0, &mut params).unwrap();
     let params = Params::init(params.entries(), Key::new(3, Purpose::Init, &[0]).stream());
     (config, task, params)
 }
@@ -256,7 +256,7 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         let states = States::new(&task, steps * sequences);
         let features = spec.compute(&states.part(&task, 0, steps * sequences));
         let output = |tensors: Vec<Tensor>| {
-            let net = build(&config, &spec, agents, 5, 1.0, &mut ParamBuilder::with(tensors)).unwrap();
+            let net = build(&config, &spec, 5, 1.0, &mut ParamBuilder::with(tensors)).unwrap();
             let input = Input {
                 steps,
                 sequences,
@@ -272,7 +272,7 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         assert_eq!(out.dims(), [steps * sequences * agents, 5]);
         let gradient = params.gradient(&vars, &probe(&out).backward().unwrap()).unwrap();
         for entry in params.entries.clone() {
-            let own = &gradient[entry.start..entry.start + entry.len()];
+            let own = &gradient[entry.range()];
             assert!(own.iter().all(|g| g.is_finite()), "{name} {kind}: {}", entry.name);
             let largest = (0..own.len()).max_by(|&a, &b| own[a].abs().total_cmp(&own[b].abs())).unwrap();
             assert!(own[largest] != 0.0, "{name} {kind}: {} has no gradient", entry.name);
@@ -310,7 +310,7 @@ fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
         let (count, agents) = (7, 9);
         let (config, task, params) = drawn(name, kind, agents, 5);
         let spec = feature_spec(&config, &task);
-        let net = build(&config, &spec, agents, 5, 1.0, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
+        let net = build(&config, &spec, 5, 1.0, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
         let states = States::new(&task, count);
         let run = |from: usize, to: usize| {
             let features = spec.compute(&states.part(&task, from, to));

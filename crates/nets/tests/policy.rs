@@ -8,7 +8,7 @@ use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{Acted, Chooser, Evaluated, Input, Model, Policy};
+use magex_nets::executor::{Chooser, Evaluated, Input, Model, Policy};
 use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params, to_safetensors};
@@ -47,7 +47,7 @@ impl Decoder {
 const IDENTITY: Activation = Activation::Identity;
 
 impl Policy for Decoder {
-    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted> {
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>> {
         let rows = input.steps * input.sequences * input.agents;
         let mut actions = vec![0; rows];
         for agent in 0..input.agents {
@@ -56,7 +56,7 @@ impl Policy for Decoder {
                 actions[row] = choose.choose(row, &logits[row])[0];
             }
         }
-        Ok(Acted { states: None })
+        Ok(None)
     }
 
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
@@ -178,7 +178,7 @@ fn a_loaded_policy_acts_as_the_one_that_was_written_and_evaluation_agrees_with_a
     let loaded = model.load_policy(&to_safetensors(&published, "").unwrap()).unwrap();
     let act = |policy: &dyn Policy| {
         let mut sampler = Sampler::new(model.heads(), STATES, AGENTS, None);
-        let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap().states.unwrap();
+        let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap().unwrap();
         (sampler.actions, sampler.log_probs, states.flatten_all().unwrap().to_vec1::<f32>().unwrap())
     };
     let (actions, log_probs, states) = act(own.as_ref());

@@ -1,68 +1,49 @@
 //! Agreement of the exact solver with recorded problems (`format` = `assignment-golden-1`): each holds a cost matrix or
 //! agent and goal points, the optimal cost, one optimal matching and whether it is the only one.
 
-use crate::error::RecordingError;
 use crate::reader::Field;
+use crate::report::{Report, worse};
 use magex_assign::{Solver, UNASSIGNED, cost_of};
+use magex_core::error::FieldError;
 
 #[cfg(test)]
 mod tests;
 
-/// Name of the recording's format.
-pub const FORMAT: &str = "assignment-golden-1";
-/// Largest relative error of a cost.
-pub const TOLERANCE: f64 = 1e-9;
+pub(crate) const FORMAT: &str = "assignment-golden-1";
+const TOLERANCE: f64 = 1e-9;
 /// Most rows, columns and problems of a recording.
 const MOST: usize = 100_001;
 
-/// What a recording says about the solver.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct AssignmentReport {
-    /// Problems compared.
-    pub problems: usize,
-    /// Problems whose matching was compared too, because it is the only optimal one.
-    pub matchings: usize,
-    /// Largest relative error of a cost.
-    pub worst: f64,
-    /// Every problem beyond the tolerance, with a wrong matching, or rejected by the solver: its name and the reason.
-    pub mismatches: Vec<String>,
-}
-
-impl AssignmentReport {
-    /// True if every problem agrees.
-    pub fn agrees(&self) -> bool {
-        self.problems > 0 && self.mismatches.is_empty()
-    }
-}
-
 /// Solves every problem of a recording and compares costs (relative [`TOLERANCE`]) and, where the optimum is unique,
-/// matchings.
-///
-/// # Errors
-/// Text that is not JSON, another format, no cases, and any field that is missing, of the wrong kind, not finite or
-/// inconsistent with its neighbours.
-pub fn verify_assignment(text: &str) -> Result<AssignmentReport, RecordingError> {
-    let value: serde_json::Value = serde_json::from_str(text)?;
-    let root = Field::root(&value);
-    let format = root.get("format")?.text()?;
-    if format != FORMAT {
-        return Err(RecordingError::Format { found: format.to_owned(), expected: FORMAT });
-    }
+/// matchings. A problem beyond the tolerance, with a wrong matching, or rejected by the solver is a mismatch that names it.
+pub(crate) fn verify(root: &Field<'_>) -> Result<Report, FieldError> {
     let cases = root.get("cases")?;
     let mut solver = Solver::default();
-    let mut report = AssignmentReport::default();
+    let mut report = Report::default();
+    let (mut problems, mut unique, mut worst) = (0, 0, 0.0);
     for case in cases.items(MOST)? {
-        compare(&Case::read(&case)?, &mut solver, &mut report);
+        let case = Case::read(&case)?;
+        problems += 1;
+        unique += usize::from(case.unique);
+        worst = worse(worst, compare(&case, &mut solver, &mut report.mismatches));
     }
-    if report.problems == 0 { Err(cases.wrong("is empty")) } else { Ok(report) }
+    if problems == 0 {
+        return Err(cases.wrong("is empty"));
+    }
+    report.content = format!("{problems} problems, {unique} with one optimum");
+    report.limited("relative cost", worst, TOLERANCE);
+    Ok(report)
 }
 
-fn compare(case: &Case, solver: &mut Solver, report: &mut AssignmentReport) {
-    report.problems += 1;
-    let mut fail = |reason: String| report.mismatches.push(format!("{}: {reason}", case.name));
+/// The relative error of the cost.
+fn compare(case: &Case, solver: &mut Solver, mismatches: &mut Vec<String>) -> f64 {
+    let mut fail = |reason: String| mismatches.push(format!("{}: {reason}", case.name));
     let answer = match solver.solve(&case.cost, case.rows, case.cols) {
         Ok(answer) => answer,
-        Err(error) => return fail(format!("the solver rejected it: {error}")),
+        Err(error) => {
+            fail(format!("the solver rejected it: {error}"));
+            return 0.0;
+        }
     };
     // The matching is judged by the matrix, not by the sum the solver claims.
     let found = cost_of(&case.cost, case.cols, &answer.col_of_row);
@@ -76,17 +57,13 @@ fn compare(case: &Case, solver: &mut Solver, report: &mut AssignmentReport) {
     if error.is_nan() || error > TOLERANCE {
         fail(format!("cost {found} differs from {} by {error:.1e} (limit {TOLERANCE:.0e})", case.expected));
     }
-    if case.unique {
-        report.matchings += 1;
-        if answer.col_of_row != case.col_of_row {
-            let place = answer.col_of_row.iter().zip(&case.col_of_row).position(|(a, b)| a != b).unwrap_or_default();
-            fail(format!("row {place} has another column than the only optimal matching"));
-        }
+    if case.unique && answer.col_of_row != case.col_of_row {
+        let place = answer.col_of_row.iter().zip(&case.col_of_row).position(|(a, b)| a != b).unwrap_or_default();
+        fail(format!("row {place} has another column than the only optimal matching"));
     }
-    report.worst = crate::check::worse(report.worst, error);
+    error
 }
 
-/// A problem as recorded.
 struct Case {
     name: String,
     rows: usize,
@@ -100,24 +77,16 @@ struct Case {
 }
 
 impl Case {
-    fn read(case: &Field<'_>) -> Result<Self, RecordingError> {
-        let size = |name: &str| {
-            let field = case.get(name)?;
-            match field.index(MOST)? {
-                0 => Err(field.wrong("must be at least 1")),
-                size => Ok(size),
-            }
-        };
-        let (rows, cols) = (size("rows")?, size("cols")?);
+    fn read(case: &Field<'_>) -> Result<Self, FieldError> {
+        let (rows, cols) = (case.get("rows")?.count(MOST)?, case.get("cols")?.count(MOST)?);
         let cost = match (case.optional("matrix")?, case.optional("agents")?, case.optional("goals")?) {
             (Some(matrix), None, None) => matrix.each(rows * cols, Field::number)?,
-            (None, Some(agents), Some(goals)) => euclidean(&agents.points(rows)?, &goals.points(cols)?),
+            (None, Some(agents), Some(goals)) => {
+                euclidean(&agents.each(rows, Field::array)?, &goals.each(cols, Field::array)?)
+            }
             _ => {
                 let field = format!("{}.matrix", case.path());
-                return Err(RecordingError::Field {
-                    field,
-                    problem: "either matrix or both agents and goals are needed".into(),
-                });
+                return Err(FieldError::new(field, "either matrix or both agents and goals are needed"));
             }
         };
         Ok(Self {
@@ -132,7 +101,7 @@ impl Case {
     }
 }
 
-fn matching(case: &Field<'_>, rows: usize, cols: usize) -> Result<Vec<u32>, RecordingError> {
+fn matching(case: &Field<'_>, rows: usize, cols: usize) -> Result<Vec<u32>, FieldError> {
     let pairs = rows.min(cols);
     let row_ind = case.get("row_ind")?.each(pairs, |row| row.index(rows))?;
     let col_ind = case.get("col_ind")?;

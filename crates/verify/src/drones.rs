@@ -1,9 +1,9 @@
 //! Agreement with recordings of gym-pybullet-drones: trajectories (`drone-golden-1`), calls of the controller
 //! (`drone-controller-golden-1`) and forces of the effects (`drone-forces-golden-1`).
 //!
-//! A trajectory is asked four questions. Does one step of the reference model from every recorded state lead to the
-//! next one (insensitive to chaos)? Does a whole run stay with the recorded one while it is well conditioned? Does the
-//! controller, fed the recorded states, give the recorded rpm? Does it hold the same in closed loop?
+//! A flight is asked four questions: does one step of the reference model from every recorded state lead to the next one
+//! (insensitive to chaos); does a whole run stay with the recorded one while it is well conditioned; does the controller,
+//! fed the recorded states, give the recorded rpm; and does it hold the same in closed loop?
 
 mod calls;
 mod engine;
@@ -11,61 +11,31 @@ mod exact;
 mod forces;
 mod recording;
 
-use crate::check::{self, Check, worse};
-use crate::error::RecordingError;
 use crate::reader::Field;
+use crate::report::{Report, worse};
+use magex_core::error::FieldError;
 use recording::Trajectory;
 
-/// How far the drones of `magex-env` are from a recording.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DroneReport {
-    /// What was compared, for example `PYB velocity, N = 1, 600 steps at 240 Hz`.
-    pub content: String,
-    /// The differences.
-    pub checks: Vec<Check>,
+pub(crate) use calls::verify as verify_calls;
+pub(crate) use forces::verify as verify_forces;
+
+pub(crate) const FLIGHT: &str = "drone-golden-1";
+pub(crate) const CALLS: &str = "drone-controller-golden-1";
+pub(crate) const FORCES: &str = "drone-forces-golden-1";
+/// Largest one-step difference of the reference model, over max(1, |recorded|).
+const ONE_STEP: f64 = 1e-12;
+/// Largest difference of a free run up to the recording's `free_run_horizon_steps`, over max(1, |recorded|).
+const FREE_RUN: f64 = 1e-9;
+/// Largest relative difference of the controller's rpm and of the effects' forces.
+const RELATIVE: f64 = 1e-6;
+
+/// Compares the reference model, the controller and the task's engine with a recorded flight.
+pub(crate) fn verify_flight(root: &Field<'_>) -> Result<Report, FieldError> {
+    let recording = Trajectory::read(root)?;
+    let mut report = exact::verify(&recording);
+    engine::verify(&recording, &mut report);
+    Ok(report)
 }
-
-impl DroneReport {
-    /// Largest one-step difference of the reference model, over max(1, |recorded|).
-    pub const ONE_STEP: f64 = 1e-12;
-    /// Largest difference of a free run up to the recording's `free_run_horizon_steps`, over max(1, |recorded|).
-    pub const FREE_RUN: f64 = 1e-9;
-    /// Largest relative difference of the controller's rpm and of the effects' forces.
-    pub const RELATIVE: f64 = 1e-6;
-
-    /// Whether everything is within its limit.
-    pub fn agrees(&self) -> bool {
-        self.disagreements().is_empty()
-    }
-
-    /// The differences that exceed their limits, in words.
-    pub fn disagreements(&self) -> Vec<String> {
-        check::disagreements(&self.checks)
-    }
-}
-
-/// Reads a recording of any of the three formats and measures the agreement with it.
-pub fn verify_drones(text: &str) -> Result<DroneReport, RecordingError> {
-    let value: serde_json::Value = serde_json::from_str(text)?;
-    let root = Field::root(&value);
-    let format = root.get("format")?;
-    match format.text()? {
-        "drone-golden-1" => {
-            let recording = Trajectory::read(&root)?;
-            let mut report = exact::verify(&recording);
-            engine::verify(&recording, &mut report);
-            Ok(report)
-        }
-        "drone-controller-golden-1" => calls::verify(&root),
-        "drone-forces-golden-1" => forces::verify(&root),
-        other => Err(format.wrong(format!(
-            "'{other}' is not supported; use drone-golden-1, drone-controller-golden-1 or drone-forces-golden-1"
-        ))),
-    }
-}
-
-/// The formats of [`verify_drones`].
-pub const FORMATS: [&str; 3] = ["drone-golden-1", "drone-controller-golden-1", "drone-forces-golden-1"];
 
 /// Largest |a − b| / max(1, |b|).
 fn apart(ours: &[f64], recorded: &[f64]) -> f64 {

@@ -2,27 +2,25 @@
 //!
 //! | module | recordings of |
 //! |---|---|
-//! | [`particles`] | the authors' particle simulator (Simple Spread, Push Ball) |
-//! | [`drones`] | gym-pybullet-drones: flights, controller calls, forces |
-//! | [`assignment`] | optimal assignments (scipy) |
+//! | `particles` | the authors' particle simulator (Simple Spread, Push Ball) |
+//! | `drones` | gym-pybullet-drones: flights, controller calls, forces |
+//! | `assignment` | optimal assignments (scipy) |
 //!
 //! [`verify_dir`] checks every JSON file below a folder by the `format` that the file names. Files of other formats are
 //! listed and skipped. A file of a supported format that cannot be read is a failure, and so is a folder without any
 //! supported recording.
 
-pub mod assignment;
-pub mod drones;
-pub mod particles;
-
-mod check;
-mod error;
+mod assignment;
+mod drones;
+mod particles;
 mod reader;
+mod report;
 
-pub use check::Check;
-pub use error::RecordingError;
+pub use report::Check;
 
-use drones::verify_drones;
-use particles::{MpeReport, verify_mpe};
+use magex_core::error::FieldError;
+use reader::Field;
+use report::Report;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
@@ -108,7 +106,7 @@ pub fn verify_dir(dir: &Path) -> Result<VerifyReport, VerifyError> {
     paths.sort();
     let files = paths.iter().map(|path| {
         let shown = path.strip_prefix(dir).ok().filter(|rest| !rest.as_os_str().is_empty()).unwrap_or(path);
-        verify_file(path, shown)
+        verify_file(shown, std::fs::read_to_string(path))
     });
     Ok(VerifyReport { files: files.collect() })
 }
@@ -127,87 +125,58 @@ fn walk(dir: &Path, paths: &mut Vec<PathBuf>) -> Result<(), VerifyError> {
     Ok(())
 }
 
-fn verify_file(path: &Path, shown: &Path) -> FileReport {
-    let mut report = FileReport {
-        path: shown.to_owned(),
-        format: String::new(),
-        content: String::new(),
-        checks: Vec::new(),
-        outcome: Outcome::Agrees,
+fn verify_file(path: &Path, text: std::io::Result<String>) -> FileReport {
+    let mut format = String::new();
+    let compared = match text {
+        Ok(text) => compare(&text, &mut format).map_err(|refusal| match refusal {
+            Refusal::Unsupported(reason) => Outcome::Skipped(reason),
+            Refusal::Malformed(error) => Outcome::Fails(vec![error.to_string()]),
+        }),
+        Err(error) => Err(Outcome::Fails(vec![error.to_string()])),
     };
-    match std::fs::read_to_string(path) {
-        Ok(text) => verify_text(&text, &mut report),
-        Err(error) => report.outcome = fails(error),
-    }
-    report
+    let (report, outcome) = match compared {
+        Ok(report) => match report.disagreements() {
+            reasons if reasons.is_empty() => (report, Outcome::Agrees),
+            reasons => (report, Outcome::Fails(reasons)),
+        },
+        Err(outcome) => (Report::default(), outcome),
+    };
+    FileReport { path: path.to_owned(), format, content: report.content, checks: report.checks, outcome }
 }
 
-fn verify_text(text: &str, report: &mut FileReport) {
-    // Only the format is needed here; the check of that format parses the rest with its own messages.
-    #[derive(serde::Deserialize)]
-    struct Head {
-        format: Option<serde_json::Value>,
-    }
-    let head: Head = match serde_json::from_str(text) {
-        Ok(head) => head,
-        Err(error) => return report.outcome = fails(format!("not a JSON object: {error}")),
-    };
-    let Some(format) = head.format.as_ref().and_then(|format| format.as_str()) else {
-        return report.outcome = fails("format: missing or not a text");
-    };
-    report.format = format.to_owned();
-    match format {
-        particles::FORMAT => match verify_mpe(text) {
-            Ok(measured) => mpe(&measured, report),
-            Err(error @ RecordingError::UnsupportedScenario { .. }) => {
-                report.outcome = Outcome::Skipped(error.to_string())
-            }
-            Err(error) => report.outcome = fails(error),
-        },
-        assignment::FORMAT => match assignment::verify_assignment(text) {
-            Ok(measured) => assignment_problems(measured, report),
-            Err(error) => report.outcome = fails(error),
-        },
-        format if drones::FORMATS.contains(&format) => match verify_drones(text) {
-            Ok(measured) => {
-                report.settle(measured.disagreements());
-                (report.content, report.checks) = (measured.content, measured.checks);
-            }
-            Err(error) => report.outcome = fails(error),
-        },
-        other => report.outcome = Outcome::Skipped(format!("format {other} is not supported by this version")),
-    }
+/// Why a file was not compared.
+#[derive(Debug, Error)]
+enum Refusal {
+    /// A recording of another kind; in words.
+    #[error("{0}")]
+    Unsupported(String),
+    /// A recording that is malformed; names the field.
+    #[error(transparent)]
+    Malformed(#[from] FieldError),
 }
 
-impl FileReport {
-    fn settle(&mut self, disagreements: Vec<String>) {
-        if !disagreements.is_empty() {
-            self.outcome = Outcome::Fails(disagreements);
+/// Compares a recording; `format` becomes the format that it names.
+fn compare(text: &str, format: &mut String) -> Result<Report, Refusal> {
+    let value: serde_json::Value =
+        serde_json::from_str(text).map_err(|e| FieldError::new("recording", format!("not valid JSON: {e}")))?;
+    let root = Field::root(&value);
+    root.get("format")?.text()?.clone_into(format);
+    match format.as_str() {
+        particles::FORMAT => {
+            let scenario = root.get("scenario")?.text()?;
+            if particles::SCENARIOS.contains(&scenario) {
+                return Ok(particles::verify(&root)?);
+            }
+            let known = particles::SCENARIOS.join(" or ");
+            let reason = format!("scenario: '{scenario}' is not supported; use a recording of scenario {known}");
+            Err(Refusal::Unsupported(reason))
         }
+        assignment::FORMAT => Ok(assignment::verify(&root)?),
+        drones::FLIGHT => Ok(drones::verify_flight(&root)?),
+        drones::CALLS => Ok(drones::verify_calls(&root)?),
+        drones::FORCES => Ok(drones::verify_forces(&root)?),
+        other => Err(Refusal::Unsupported(format!("format {other} is not supported by this version"))),
     }
-}
-
-fn mpe(measured: &MpeReport, report: &mut FileReport) {
-    let one_step = measured.one_step_position.max(measured.one_step_velocity);
-    report.content =
-        format!("N = {}, {} steps, {} of them free", measured.agents, measured.steps, measured.free_run_steps);
-    report.checks = vec![
-        Check::limited("one step", one_step, MpeReport::ONE_STEP),
-        Check::limited("free run", measured.free_run_position, MpeReport::FREE_RUN),
-        Check::limited("reward", measured.reward, MpeReport::ONE_STEP),
-        Check::limited("success", measured.success_rate, MpeReport::ONE_STEP),
-    ];
-    report.settle(measured.disagreements());
-}
-
-fn assignment_problems(measured: assignment::AssignmentReport, report: &mut FileReport) {
-    report.content = format!("{} problems, {} with one optimum", measured.problems, measured.matchings);
-    report.checks = vec![Check::limited("relative cost", measured.worst, assignment::TOLERANCE)];
-    report.settle(measured.mismatches);
-}
-
-fn fails(reason: impl fmt::Display) -> Outcome {
-    Outcome::Fails(vec![reason.to_string()])
 }
 
 impl fmt::Display for VerifyReport {
@@ -248,9 +217,9 @@ impl fmt::Display for VerifyReport {
         let (agreeing, failing, skipped) = (self.agreeing(), self.failing(), self.skipped());
         write!(f, "{agreeing} agree, {failing} fail, {skipped} skipped")?;
         if agreeing + failing == 0 {
-            let drones = drones::FORMATS.join(", ");
-            let (particles, assignment) = (particles::FORMAT, assignment::FORMAT);
-            write!(f, "; FAIL: no recording of a supported format ({particles}, {assignment}, {drones})")?;
+            let known =
+                [particles::FORMAT, assignment::FORMAT, drones::FLIGHT, drones::CALLS, drones::FORCES].join(", ");
+            write!(f, "; FAIL: no recording of a supported format ({known})")?;
         }
         Ok(())
     }
@@ -264,15 +233,7 @@ mod tests {
         "row_ind":[0,1],"col_ind":[0,1],"cost":2,"unique":true}]}"#;
 
     fn verify(text: &str) -> FileReport {
-        let mut report = FileReport {
-            path: "case.json".into(),
-            format: String::new(),
-            content: String::new(),
-            checks: Vec::new(),
-            outcome: Outcome::Agrees,
-        };
-        verify_text(text, &mut report);
-        report
+        verify_file(Path::new("case.json"), Ok(text.to_owned()))
     }
 
     #[test]
@@ -282,10 +243,10 @@ mod tests {
         for (text, reason) in [
             (GOOD.replace("\"cost\":2", "\"cost\":3"), "cost 2 differs from 3"),
             (GOOD.replace("\"cost\":2", "\"cost\":\"2\""), "cases[0].cost"),
-            ("{".into(), "not a JSON object"),
-            ("[]".into(), "not a JSON object"),
-            ("{}".into(), "format: missing"),
-            (r#"{"format":"mpe-golden-1"}"#.into(), ""),
+            ("{".into(), "recording: not valid JSON"),
+            ("[]".into(), "recording: must be an object"),
+            ("{}".into(), "format: is missing"),
+            (r#"{"format":"mpe-golden-1"}"#.into(), "scenario"),
         ] {
             let Outcome::Fails(reasons) = verify(&text).outcome else { panic!("{text} passes") };
             assert!(reasons[0].contains(reason), "{reasons:?}");

@@ -1,6 +1,6 @@
 //! JSON values that know where they are, so that every error names its field.
 
-use crate::error::RecordingError;
+use magex_core::error::FieldError;
 use serde_json::Value;
 
 /// A value and its path in the file.
@@ -16,19 +16,18 @@ impl<'a> Field<'a> {
         Self { path: String::new(), value }
     }
 
-    /// An error that names this field.
-    pub(crate) fn wrong(&self, problem: impl Into<String>) -> RecordingError {
+    pub(crate) fn wrong(&self, problem: impl Into<String>) -> FieldError {
         let field = if self.path.is_empty() { "recording" } else { &self.path };
-        RecordingError::Field { field: field.to_owned(), problem: problem.into() }
+        FieldError::new(field, problem)
     }
 
     /// A member of an object.
-    pub(crate) fn get(&self, name: &str) -> Result<Field<'a>, RecordingError> {
+    pub(crate) fn get(&self, name: &str) -> Result<Field<'a>, FieldError> {
         let path = if self.path.is_empty() { name.to_owned() } else { format!("{}.{name}", self.path) };
         let object = self.value.as_object().ok_or_else(|| self.wrong("must be an object"))?;
         match object.get(name) {
             Some(value) => Ok(Field { path, value }),
-            None => Err(RecordingError::Field { field: path, problem: "is missing".into() }),
+            None => Err(FieldError::new(path, "is missing")),
         }
     }
 
@@ -38,7 +37,7 @@ impl<'a> Field<'a> {
     }
 
     /// A member of an object, unless it is missing or null.
-    pub(crate) fn optional(&self, name: &str) -> Result<Option<Field<'a>>, RecordingError> {
+    pub(crate) fn optional(&self, name: &str) -> Result<Option<Field<'a>>, FieldError> {
         match self.get(name) {
             Ok(field) => Ok(Some(field).filter(|field| !field.is_null())),
             Err(_) if self.value.is_object() => Ok(None),
@@ -46,39 +45,45 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Whether the field is JSON's null.
     pub(crate) fn is_null(&self) -> bool {
         self.value.is_null()
     }
 
-    pub(crate) fn text(&self) -> Result<&'a str, RecordingError> {
+    pub(crate) fn text(&self) -> Result<&'a str, FieldError> {
         self.value.as_str().ok_or_else(|| self.wrong("must be a string"))
     }
 
-    pub(crate) fn flag(&self) -> Result<bool, RecordingError> {
+    pub(crate) fn flag(&self) -> Result<bool, FieldError> {
         self.value.as_bool().ok_or_else(|| self.wrong("must be true or false"))
     }
 
     /// A finite number.
-    pub(crate) fn number(&self) -> Result<f64, RecordingError> {
+    pub(crate) fn number(&self) -> Result<f64, FieldError> {
         let number = self.value.as_f64().filter(|number| number.is_finite());
         number.ok_or_else(|| self.wrong("must be a finite number"))
     }
 
-    /// A finite number above zero.
-    pub(crate) fn positive(&self) -> Result<f64, RecordingError> {
+    pub(crate) fn positive(&self) -> Result<f64, FieldError> {
         let number = self.number()?;
         if number > 0.0 { Ok(number) } else { Err(self.wrong(format!("{number} must be above 0"))) }
     }
 
     /// A whole number in 0..bound.
-    pub(crate) fn index(&self, bound: usize) -> Result<usize, RecordingError> {
+    pub(crate) fn index(&self, bound: usize) -> Result<usize, FieldError> {
         let index = self.value.as_u64().and_then(|index| usize::try_from(index).ok());
         index.filter(|&index| index < bound).ok_or_else(|| self.wrong(format!("must be a whole number below {bound}")))
     }
 
+    /// A whole number in 1..bound.
+    pub(crate) fn count(&self, bound: usize) -> Result<usize, FieldError> {
+        match self.index(bound)? {
+            0 => Err(self.wrong("must be at least 1")),
+            count => Ok(count),
+        }
+    }
+
     /// The elements of a list of known length.
-    pub(crate) fn list(&self, len: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, RecordingError> {
+    pub(crate) fn list(&self, len: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, FieldError> {
         let list = self.value.as_array().ok_or_else(|| self.wrong("must be a list"))?;
         if list.len() != len {
             return Err(self.wrong(format!("has {} entries, {len} are needed", list.len())));
@@ -88,7 +93,7 @@ impl<'a> Field<'a> {
     }
 
     /// The elements of a list of at most `most`.
-    pub(crate) fn items(&self, most: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, RecordingError> {
+    pub(crate) fn items(&self, most: usize) -> Result<impl Iterator<Item = Field<'a>> + use<'a>, FieldError> {
         let len = self.value.as_array().ok_or_else(|| self.wrong("must be a list"))?.len();
         if len > most {
             return Err(self.wrong(format!("has {len} entries, at most {most} are supported")));
@@ -100,16 +105,33 @@ impl<'a> Field<'a> {
     pub(crate) fn each<T>(
         &self,
         len: usize,
-        read: impl Fn(&Field<'a>) -> Result<T, RecordingError>,
-    ) -> Result<Vec<T>, RecordingError> {
+        read: impl Fn(&Field<'a>) -> Result<T, FieldError>,
+    ) -> Result<Vec<T>, FieldError> {
         self.list(len)?.map(|field| read(&field)).collect()
     }
 
-    /// A list of points `[len][2]`.
-    pub(crate) fn points(&self, len: usize) -> Result<Vec<[f64; 2]>, RecordingError> {
-        self.each(len, |point| {
-            let pair = point.each(2, Field::number)?;
-            Ok([pair[0], pair[1]])
-        })
+    /// The elements of a list of N, read.
+    pub(crate) fn fixed<T, const N: usize>(
+        &self,
+        read: impl Fn(&Field<'a>) -> Result<T, FieldError>,
+    ) -> Result<[T; N], FieldError> {
+        self.each(N, read)?.try_into().map_err(|_| self.wrong(format!("must have {N} entries")))
+    }
+
+    /// N finite numbers.
+    pub(crate) fn array<const N: usize>(&self) -> Result<[f64; N], FieldError> {
+        self.fixed(Field::number)
+    }
+
+    /// The value before the first step, `init_<name>`, and those after each of `steps` steps, `<name>`.
+    pub(crate) fn series<T>(
+        &self,
+        name: &str,
+        steps: usize,
+        read: impl Fn(&Field<'a>) -> Result<T, FieldError>,
+    ) -> Result<Vec<T>, FieldError> {
+        let mut all = vec![read(&self.get(&format!("init_{name}"))?)?];
+        all.extend(self.get(name)?.each(steps, read)?);
+        Ok(all)
     }
 }

@@ -1,26 +1,10 @@
 //! The learning curve of a run as an SVG picture: the episode metrics that have a plot, over joint steps.
 
+use magex_core::error::FieldError;
 use magex_core::metrics_table::{METRICS, Metric, Scale, Scope};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::fmt::Write as _;
-use thiserror::Error;
-
-/// Why a picture could not be drawn.
-#[derive(Debug, Error)]
-pub enum CurveError {
-    /// A line of the metrics file is malformed.
-    #[error("metrics.jsonl line {line}: {reason}")]
-    Line {
-        /// Counted from 1.
-        line: usize,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The file has no lines yet.
-    #[error("metrics.jsonl: no iterations yet; wait for the first one to finish")]
-    Empty,
-}
 
 /// One iteration of `metrics.jsonl`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -42,16 +26,13 @@ impl MetricsLine {
 }
 
 /// Reads a metrics file. An unterminated last line is ignored (the run may be writing it). If an iteration occurs twice
-/// because the run was resumed before it, the later line counts.
-///
-/// # Errors
-/// A line that is not a JSON object with `iteration` and `joint_env_steps`; a file without lines.
-pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, CurveError> {
+/// because the run was resumed before it, the later line counts. A file without lines is refused.
+pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, FieldError> {
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     let mut lines: Vec<MetricsLine> = Vec::new();
     for (index, line) in whole.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
         let mut line: MetricsLine = serde_json::from_str(line)
-            .map_err(|error| CurveError::Line { line: index + 1, reason: error.to_string() })?;
+            .map_err(|error| FieldError::new(format!("metrics.jsonl line {}", index + 1), error.to_string()))?;
         // The last line of a run only evaluates, under the number of the iteration before it.
         if let Some(last) = lines.last().filter(|last| last.iteration == line.iteration) {
             for (key, value) in &last.values {
@@ -66,17 +47,19 @@ pub fn parse_metrics(text: &str) -> Result<Vec<MetricsLine>, CurveError> {
         }
         lines.push(line);
     }
-    if lines.is_empty() { Err(CurveError::Empty) } else { Ok(lines) }
+    if lines.is_empty() { Err(empty()) } else { Ok(lines) }
 }
 
-/// One diagram of the picture.
+fn empty() -> FieldError {
+    FieldError::new("metrics.jsonl", "no iterations yet; wait for the first one to finish")
+}
+
 struct Panel {
     title: String,
     scale: Scale,
     series: Vec<Series>,
 }
 
-/// One curve of a panel.
 struct Series {
     label: &'static str,
     colour: &'static str,
@@ -98,7 +81,6 @@ impl Panel {
         (measured || metric.scope == Scope::EveryTask).then_some(Self { title, scale, series })
     }
 
-    /// Height of the plot in pixels.
     fn height(&self) -> f64 {
         if self.scale == Scale::Share { 220.0 } else { 130.0 }
     }
@@ -121,12 +103,9 @@ const GRID: &str = "#e4e7ec";
 const BLUE: &str = "#2f6fde";
 const GREEN: &str = "#1d9a62";
 
-/// The picture as SVG text. `title` is the run's name, `subtitle` its configuration in one line.
-///
-/// # Errors
-/// No lines.
-pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, CurveError> {
-    let last = lines.last().ok_or(CurveError::Empty)?.joint_env_steps.max(1) as f64;
+/// The picture of at least one line as SVG text. `title` is the run's name, `subtitle` its configuration in one line.
+pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, FieldError> {
+    let last = lines.last().ok_or_else(empty)?.joint_env_steps.max(1) as f64;
     let panels: Vec<Panel> = METRICS.iter().filter_map(|metric| Panel::of(metric, lines)).collect();
     let height = HEADER + FOOTER + panels.iter().map(|panel| TITLE + panel.height() + GAP).sum::<f64>();
     let mut svg = Svg(format!(
@@ -314,7 +293,7 @@ mod tests {
         assert_eq!(lines.len(), 2, "the resumed iterations replace the old ones");
         let [success, cost, reward] = ["success_rate", "cost_ratio", "reward"].map(|key| lines[0].get(key));
         assert_eq!((success, cost, reward), (Some(0.25), None, Some(-1.5)));
-        assert!(matches!(parse_metrics(""), Err(CurveError::Empty)));
+        assert_eq!(parse_metrics(""), Err(empty()));
         let error = parse_metrics(&format!("{LINE}\nnonsense\n")).unwrap_err().to_string();
         assert!(error.starts_with("metrics.jsonl line 2"), "{error}");
         let error = parse_metrics("{\"iteration\":3}\n").unwrap_err().to_string();
@@ -352,7 +331,7 @@ mod tests {
         assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("joint environment steps"));
         assert_eq!((svg.matches("<polyline").count(), svg.matches("<circle").count()), (8, 29));
         assert!(svg.contains("arrival, steps") && !svg.contains("second cost"), "no panel without the metric");
-        assert!(matches!(curve_svg("run", "", &[]), Err(CurveError::Empty)));
+        assert_eq!(curve_svg("run", "", &[]), Err(empty()));
     }
 
     #[test]

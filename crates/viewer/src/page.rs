@@ -17,6 +17,7 @@ use magex_proto::v1;
 use magex_proto::weights::Weights;
 use magex_runtime::sync::lock;
 use points::Points;
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::io::BufRead as _;
 use std::path::Path;
@@ -36,9 +37,11 @@ const FAREWELL: Duration = Duration::from_secs(2);
 const QUIET: Duration = Duration::from_millis(500);
 
 /// What the training thread is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Phase {
     /// Training has not begun.
+    #[default]
     Starting,
     /// Waiting for training episodes.
     Collecting,
@@ -71,7 +74,7 @@ pub struct RunInfo {
 }
 
 /// State of the run as the training thread reports it.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Run {
     run_id: String,
     phase: Phase,
@@ -93,7 +96,6 @@ struct Episode {
 #[derive(Debug)]
 struct Snapshot {
     made: Instant,
-    /// Whether the run had ended.
     over: bool,
     body: Bytes,
 }
@@ -114,7 +116,6 @@ pub struct LivePage {
     /// Incremented by every change of the fields above.
     revision: watch::Sender<u64>,
     viewers: Semaphore,
-    /// When the last request was answered.
     asked: Mutex<Option<Instant>>,
 }
 
@@ -135,15 +136,7 @@ impl LivePage {
             info,
             task: words,
             scene: Scene::of(task),
-            run: Mutex::new(Run {
-                run_id: String::new(),
-                phase: Phase::Starting,
-                end: None,
-                version: None,
-                sha256: String::new(),
-                latest: Value::Null,
-                summary: Value::Null,
-            }),
+            run: Mutex::default(),
             points: Mutex::default(),
             episode: Mutex::default(),
             snapshot: Mutex::default(),
@@ -187,7 +180,7 @@ impl LivePage {
         let Some((outcome, recording)) = outcomes.iter().find_map(|o| Some((o, o.recording.as_ref()?))) else { return };
         let version = outcome.shard.version.0;
         let name = format!("version {version}, episode {}", outcome.shard.first_episode + 1);
-        let packed = match self.scene.pack(&name, recording, outcome.metrics.first()) {
+        let packed = match self.scene.pack(name, recording, outcome.metrics.first()) {
             Ok(packed) => packed,
             Err(error) => {
                 tracing::warn!(%error, "an evaluation episode cannot be drawn");
@@ -226,11 +219,6 @@ impl LivePage {
         }
     }
 
-    /// Records that a request was answered.
-    fn answered(&self) {
-        *lock(&self.asked) = Some(Instant::now());
-    }
-
     fn change(&self, change: impl FnOnce(&mut Run)) {
         change(&mut lock(&self.run));
         self.revision.send_modify(|revision| *revision += 1);
@@ -251,10 +239,6 @@ impl LivePage {
 
     fn current(&self) -> u64 {
         *self.revision.borrow()
-    }
-
-    fn episode(&self) -> Option<Episode> {
-        lock(&self.episode).clone()
     }
 
     /// The rows of the curves after line `after`; all of them if `process` is not this process.
@@ -284,9 +268,9 @@ impl LivePage {
         let episode = lock(&self.episode).as_ref().map(|episode| episode.tag.clone());
         let run = lock(&self.run);
         let (state, reason) = match (&run.end, &status) {
-            (Some((state, reason)), _) => (*state, reason.clone()),
-            (None, Some(status)) => (state_name(status.state()), None),
-            (None, None) => (phase_name(run.phase), None),
+            (Some((state, reason)), _) => (json!(state), reason.clone()),
+            (None, Some(status)) => (json!(state_name(status.state())), None),
+            (None, None) => (json!(run.phase), None),
         };
         let mut value = json!({
             "process": self.process, "revision": revision, "run_id": run.run_id, "name": self.info.name,
@@ -323,23 +307,10 @@ fn describe_ledger(ledger: &v1::LedgerStatus) -> Value {
     })
 }
 
-fn state_name(state: v1::RunState) -> &'static str {
+/// The name of a state: `RUN_STATE_TRAINING` is `training`.
+fn state_name(state: v1::RunState) -> String {
     match state {
-        v1::RunState::Unspecified => "starting",
-        v1::RunState::WaitingForActors => "waiting_for_actors",
-        v1::RunState::Collecting => "collecting",
-        v1::RunState::Training => "training",
-        v1::RunState::Evaluating => "evaluating",
-        v1::RunState::Finished => "finished",
-        v1::RunState::Draining => "draining",
-    }
-}
-
-fn phase_name(phase: Phase) -> &'static str {
-    match phase {
-        Phase::Starting => "starting",
-        Phase::Collecting => "collecting",
-        Phase::Evaluating => "evaluating",
-        Phase::Training => "training",
+        v1::RunState::Unspecified => "starting".to_owned(),
+        state => state.as_str_name().trim_start_matches("RUN_STATE_").to_lowercase(),
     }
 }

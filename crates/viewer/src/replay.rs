@@ -1,59 +1,12 @@
 //! A replay: one self-contained HTML file. It draws a [`Scene`], like the episode on the live page.
 
 use crate::scene::{PackedEpisode, SCRIPT, Scene};
+use magex_core::error::FieldError;
 use magex_core::task::TaskConfig;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use serde::Serialize;
-use thiserror::Error;
 
 const PAGE: &str = include_str!("replay.html");
-
-/// Why a replay could not be written.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum ReplayError {
-    /// Nothing to show.
-    #[error("episodes: there is nothing to replay; record at least one evaluation episode")]
-    Empty,
-    /// An array does not have the length its shape asks for, or holds something that cannot be drawn.
-    #[error("episodes[{episode}].{field}: {reason}")]
-    Recording {
-        /// Index of the episode.
-        episode: usize,
-        /// Which array.
-        field: &'static str,
-        /// What is wrong with it.
-        reason: String,
-    },
-}
-
-/// Texts of a page, and the sizes that its script needs.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ReplayInfo {
-    /// Headline, for example the run's name.
-    pub title: String,
-    /// One line below: task, weights, scheduler.
-    pub subtitle: String,
-    /// Sizes of the task.
-    pub scene: Scene,
-}
-
-impl ReplayInfo {
-    /// With the sizes of a task.
-    pub fn of(task: &TaskConfig, title: impl Into<String>, subtitle: impl Into<String>) -> Self {
-        Self { title: title.into(), subtitle: subtitle.into(), scene: Scene::of(task) }
-    }
-}
-
-/// One episode of a page.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ReplayEpisode<'a> {
-    /// Its name in the list, for example `episode 3`.
-    pub name: String,
-    /// The states.
-    pub recording: &'a Recording,
-    /// Its scores, if known; shown beside the numbers that the page computes.
-    pub metrics: Option<EpisodeMetrics>,
-}
 
 /// The data that the script of the page reads.
 #[derive(Serialize)]
@@ -65,27 +18,26 @@ struct Page<'a> {
     episodes: Vec<PackedEpisode<'a>>,
 }
 
-/// The page, ready to be written to a file.
-///
-/// # Errors
-/// No episodes, and recordings whose arrays do not fit their shape or the task, or are not finite.
-pub fn replay_html(info: &ReplayInfo, episodes: &[ReplayEpisode<'_>]) -> Result<String, ReplayError> {
+/// The page of a task's episodes, and of their scores if these are known. It refuses no episodes, and recordings whose
+/// arrays do not fit their shape or the task, or are not finite.
+pub fn replay_html(
+    task: &TaskConfig,
+    title: &str,
+    subtitle: &str,
+    episodes: &[(Recording, Option<EpisodeMetrics>)],
+) -> Result<String, FieldError> {
     if episodes.is_empty() {
-        return Err(ReplayError::Empty);
+        return Err(FieldError::new("episodes", "there is nothing to replay; record at least one evaluation episode"));
     }
-    let packed = episodes.iter().enumerate().map(|(index, episode)| {
-        let packed = info.scene.pack(&episode.name, episode.recording, episode.metrics.as_ref());
-        packed.map_err(|e| ReplayError::Recording { episode: index, field: e.field, reason: e.reason })
+    let scene = &Scene::of(task);
+    let packed = episodes.iter().enumerate().map(|(index, (recording, metrics))| {
+        let packed = scene.pack(format!("episode {}", index + 1), recording, metrics.as_ref());
+        packed.map_err(|error| error.within(&format!("episodes[{index}]")))
     });
-    let packed = packed.collect::<Result<Vec<_>, _>>()?;
-    let page = Page { title: &info.title, subtitle: &info.subtitle, scene: &info.scene, episodes: packed };
-    let data = serde_json::to_string(&page).map_err(|error| ReplayError::Recording {
-        episode: 0,
-        field: "page",
-        reason: error.to_string(),
-    })?;
+    let page = Page { title, subtitle, scene, episodes: packed.collect::<Result<_, _>>()? };
+    let data = serde_json::to_string(&page).map_err(|error| FieldError::new("page", error.to_string()))?;
     // Placeholders are replaced outside the data only. A `<` in the data could end the script element early.
-    let title = info.title.replace('&', "&amp;").replace('<', "&lt;");
+    let title = title.replace('&', "&amp;").replace('<', "&lt;");
     let (head, tail) = PAGE.split_once("@DATA@").unwrap_or((PAGE, ""));
     let tail = tail.replacen("@SCENE@", SCRIPT, 1);
     Ok([head.replace("@TITLE@", &title), data.replace('<', "\\u003c"), tail].concat())
@@ -139,15 +91,11 @@ mod tests {
         recording
     }
 
-    fn info(name: TaskName, title: &str) -> ReplayInfo {
-        ReplayInfo::of(&TaskConfig::of(name, 5, Spawn::Uniform), title, "N = 2")
+    fn page_of(name: TaskName, title: &str, recording: &Recording) -> Result<String, FieldError> {
+        replay_html(&TaskConfig::of(name, 5, Spawn::Uniform), title, "N = 2", &[(recording.clone(), None)])
     }
 
-    fn page_of(name: TaskName, title: &str, recording: &Recording) -> Result<String, ReplayError> {
-        replay_html(&info(name, title), &[ReplayEpisode { name: "episode 0".into(), recording, metrics: None }])
-    }
-
-    fn page(title: &str, recording: &Recording) -> Result<String, ReplayError> {
+    fn page(title: &str, recording: &Recording) -> Result<String, FieldError> {
         page_of(TaskName::SimpleSpread, title, recording)
     }
 
@@ -190,7 +138,8 @@ mod tests {
         assert!(
             refuse(|r| r.agent_state.push(0.0)).starts_with("episodes[0].agent_state: 1 numbers, the shape asks for 0")
         );
-        assert_eq!(replay_html(&info(TaskName::SimpleSpread, "none"), &[]), Err(ReplayError::Empty));
+        let task = TaskConfig::of(TaskName::SimpleSpread, 5, Spawn::Uniform);
+        assert!(replay_html(&task, "none", "", &[]).unwrap_err().to_string().starts_with("episodes: there is nothing"));
     }
 
     #[test]

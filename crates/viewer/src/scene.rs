@@ -1,13 +1,14 @@
-//! A recorded episode as a page draws it: sizes of the task and packed states. [`SCRIPT`] draws it, on the live page and in
-//! replay files.
+//! A recorded episode as the live page and replay files draw it: sizes of the task and packed states.
 //!
-//! The script computes what it shows (covered landmarks, contacts, arrival) from the states and from the sizes in [`Scene`],
-//! and knows no task by name; three dimensions are seen from above, from the side and in space.
+//! [`SCRIPT`] computes what it shows (covered landmarks, contacts, arrival) from these, and knows no task by name.
 
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use magex_core::error::{FieldError, check_count};
 use magex_core::metrics_table::{METRICS, Metric};
 use magex_core::statics::LANDMARKS;
 use magex_core::task::{Group, TaskConfig};
-use magex_core::trajectory::{EpisodeMetrics, Recording};
+use magex_core::trajectory::{EpisodeMetrics, Recording, Shape};
 use serde::{Serialize, Serializer};
 
 /// Defines `makeScene`, which draws an episode on a canvas.
@@ -15,16 +16,6 @@ pub const SCRIPT: &str = include_str!("scene.js");
 
 /// States are stored as whole multiples of this; as a length in world units, a fifth of a pixel on a map of side 2.
 pub const UNIT: f64 = 1e-3;
-
-/// A recording that cannot be drawn.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{field}: {reason}")]
-pub struct SceneError {
-    /// Which array.
-    pub field: &'static str,
-    /// What is wrong with it.
-    pub reason: String,
-}
 
 /// What the script needs to know besides the states. Lengths are in world units.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -79,10 +70,10 @@ impl Scene {
             out_name: "crashed",
             agent_radius: seen.contact_radius / 2.0,
             ball_radius: 0.15,
-            landmark_radius: task.landmark_radius(),
+            landmark_radius: task.definition().landmark_radius,
             contact_distance: seen.contact_radius,
             cover_radius: seen.success_radius,
-            step_seconds: task.step_seconds(),
+            step_seconds: task.definition().step_seconds,
             ground: flies.then_some(0.0),
             chain: stages.iter().take(1).map(|stage| stage.from).chain(stages.iter().map(|stage| stage.to)).collect(),
             target_velocity: flies.then_some(0),
@@ -105,21 +96,14 @@ impl Scene {
     /// Arrays that do not fit their shape or the task, or are not finite.
     pub fn pack<'a>(
         &self,
-        name: &'a str,
+        name: String,
         recording: &'a Recording,
         metrics: Option<&EpisodeMetrics>,
-    ) -> Result<PackedEpisode<'a>, SceneError> {
+    ) -> Result<PackedEpisode<'a>, FieldError> {
         let wide = self.check(recording)?;
-        let shape = &recording.shape;
         Ok(PackedEpisode {
             name,
-            steps: shape.steps,
-            agents: shape.agents,
-            bodies: shape.bodies,
-            landmarks: shape.landmarks,
-            dims: shape.dims,
-            agent_state: shape.agent_state,
-            goals_per_agent: shape.goals_per_agent,
+            shape: recording.shape,
             wide,
             positions: pack(&recording.positions, wide),
             agent_state_values: pack(&recording.agent_state, wide),
@@ -130,25 +114,20 @@ impl Scene {
     }
 
     /// Whether some number needs 32 bits.
-    fn check(&self, recording: &Recording) -> Result<bool, SceneError> {
+    fn check(&self, recording: &Recording) -> Result<bool, FieldError> {
         let shape = &recording.shape;
-        let wrong = |field, reason| SceneError { field, reason };
+        let wrong = |field: &str, problem: String| Err(FieldError::new(field, problem));
         if shape.agents == 0 || shape.dims == 0 || shape.goals_per_agent == 0 || shape.bodies < shape.agents {
-            let reason = "agents, dims and goals_per_agent must be at least 1, and bodies at least agents";
-            return Err(wrong("shape", reason.to_owned()));
+            let problem = "agents, dims and goals_per_agent must be at least 1, and bodies at least agents";
+            return wrong("shape", problem.to_owned());
         }
-        if shape.goals_per_agent + 1 != self.chain.len() {
-            let expected = self.chain.len().saturating_sub(1);
-            return Err(wrong(
-                "shape",
-                format!("goals_per_agent is {}, the task assigns {expected} to an agent", shape.goals_per_agent),
-            ));
+        let (goals, expected) = (shape.goals_per_agent, self.chain.len().saturating_sub(1));
+        if goals != expected {
+            return wrong("shape", format!("goals_per_agent is {goals}, the task assigns {expected} to an agent"));
         }
-        if shape.agent_state < self.agent_state() {
-            return Err(wrong(
-                "shape",
-                format!("agent_state is {}, the task has {} or more", shape.agent_state, self.agent_state()),
-            ));
+        let (found, least) = (shape.agent_state, self.agent_state());
+        if found < least {
+            return wrong("shape", format!("agent_state is {found}, the task has {least} or more"));
         }
         let floats = [
             ("positions", &*recording.positions, (shape.steps + 1) * shape.bodies * shape.dims),
@@ -157,28 +136,22 @@ impl Scene {
         ];
         let mut wide = false;
         for (field, values, expected) in floats {
-            if values.len() != expected {
-                return Err(wrong(field, format!("{} numbers, the shape asks for {expected}", values.len())));
-            }
+            check_count(field, "numbers", values.len(), expected)?;
             if let Some(place) = values.iter().position(|x| x.is_nan() || x.abs() > 2e6) {
-                return Err(wrong(field, format!("entry {place} is {}, which cannot be drawn", values[place])));
+                return wrong(field, format!("entry {place} is {}, which cannot be drawn", values[place]));
             }
             wide |= values.iter().any(|&x| quantised(x).abs() > i32::from(i16::MAX));
         }
-        if recording.goals.len() != shape.agents * shape.goals_per_agent {
-            let expected = shape.agents * shape.goals_per_agent;
-            return Err(wrong("goals", format!("{} entries, the shape asks for {expected}", recording.goals.len())));
-        }
+        check_count("goals", "entries", recording.goals.len(), shape.agents * goals)?;
         for (place, &goal) in recording.goals.iter().enumerate() {
-            let group = self.chain[place % shape.goals_per_agent + 1];
+            let group = self.chain[place % goals + 1];
             let members = match group {
                 Group::Agents => shape.agents,
                 Group::Balls => shape.bodies - shape.agents,
                 Group::Landmarks => shape.landmarks,
             };
             if goal as usize >= members {
-                let reason = format!("entry {place} is {goal}, there are {members} {}", group_name(group));
-                return Err(wrong("goals", reason));
+                return wrong("goals", format!("entry {place} is {goal}, there are {members} {}", group_name(group)));
             }
         }
         Ok(wide)
@@ -195,16 +168,11 @@ impl Scene {
 }
 
 /// One episode as the script reads it.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PackedEpisode<'a> {
-    name: &'a str,
-    steps: usize,
-    agents: usize,
-    bodies: usize,
-    landmarks: usize,
-    dims: usize,
-    agent_state: usize,
-    goals_per_agent: usize,
+    name: String,
+    #[serde(flatten)]
+    shape: Shape,
     /// 32-bit instead of 16-bit numbers.
     wide: bool,
     /// `[T+1, E, D]`, base64 of little-endian whole multiples of the unit.
@@ -241,47 +209,25 @@ fn pack(values: &[f32], wide: bool) -> String {
     } else {
         values.iter().flat_map(|&x| (quantised(x) as i16).to_le_bytes()).collect()
     };
-    base64(&bytes)
-}
-
-/// RFC 4648, with padding.
-pub(crate) fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for group in bytes.chunks(3) {
-        let byte = |k: usize| u32::from(group.get(k).copied().unwrap_or(0));
-        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
-        for digit in 0..4 {
-            if digit <= group.len() {
-                text.push(char::from(DIGITS[(bits >> (18 - 6 * digit)) as usize & 63]));
-            } else {
-                text.push('=');
-            }
-        }
-    }
-    text
+    BASE64_STANDARD.encode(bytes)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use base64::Engine as _;
+    use base64::prelude::BASE64_STANDARD;
+    use magex_core::error::{FieldError, check_count};
     use magex_core::metrics_table::SECOND_COST_RATIO;
     use magex_core::task::Spawn;
     use magex_core::task::TaskName;
 
     #[test]
-    fn base64_of_the_standard() {
-        for (plain, text) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
-            assert_eq!(base64(plain.as_bytes()), text);
-        }
-    }
-
-    #[test]
     fn states_are_whole_multiples_of_the_unit() {
         assert_eq!(quantised(-40.0), -40_000);
         assert_eq!(quantised(0.0015), 2);
-        assert_eq!(pack(&[-1.5, 1.0], false), base64(&[0x24, 0xfa, 0xe8, 0x03]));
-        assert_eq!(pack(&[-1.5], true), base64(&[0x24, 0xfa, 0xff, 0xff]));
+        assert_eq!(pack(&[-1.5, 1.0], false), "JProAw==");
+        assert_eq!(pack(&[-1.5], true), "JPr//w==");
     }
 
     #[test]
@@ -309,7 +255,15 @@ mod tests {
         let word = |text: &'static str| text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').next();
         read.extend(SCRIPT.split("source.").skip(1).filter_map(word));
         let task = TaskConfig::of(TaskName::SimpleSpread, 5, Spawn::Uniform);
-        let packed = serde_json::to_value(PackedEpisode::default()).unwrap();
+        let recording = Recording {
+            shape: Shape { steps: 0, ..task.shape(1) },
+            positions: vec![0.0; 10],
+            agent_state: Vec::new(),
+            statics: Statics::landmarks(5, 2, vec![0.0; 10]),
+            goals: vec![0; 5],
+        };
+        let packed = Scene::of(&task).pack(String::new(), &recording, None).unwrap();
+        let packed = serde_json::to_value(packed).unwrap();
         let scene = serde_json::to_value(Scene::of(&task)).unwrap();
         for field in read {
             assert!(packed.get(field).is_some(), "scene.js reads source.{field}, which no episode has");

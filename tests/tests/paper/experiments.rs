@@ -1,11 +1,12 @@
 //! Section 5: tasks, implementation details, ablations.
 
-use crate::support::{actor_shapes, positions, run, scheduler, stream};
+use crate::support::{actor_shapes, run, scheduler, stream};
 use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::metrics_table::SUCCESS_RATE;
+use magex_core::statics::LANDMARKS;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
-use magex_env::{Env as _, Spread, new_env};
+use magex_env::{env_from_state, new_env};
 use magex_nets::commander::Team;
 use magex_tests::{small, small_task};
 
@@ -18,8 +19,8 @@ fn section_5_1_1_simple_spread() {
         let task = TaskConfig::simple_spread(agents, if agents == 5 { Spawn::Uniform } else { Spawn::Lines(None) });
         assert_eq!((task.side * task.side, task.horizon), (area, horizon), "{agents} agents");
         let env = new_env(&task, (0..4).map(stream), false).unwrap();
-        let at = positions(&*env, &task);
-        let far = at.iter().chain(env.landmarks()).fold(0.0f32, |far, x| far.max(x.abs()));
+        let at = env.positions();
+        let far = at.iter().chain(env.statics().get(LANDMARKS)).fold(0.0f32, |far, x| far.max(x.abs()));
         // Deviation: with the released code's scale of 1.5 the lines of 20 agents are 6.7 across, not 6.
         let half = if agents == 20 { 5.0 / 1.5 } else { task.side / 2.0 };
         assert!(far <= half + 1e-5 && far >= 0.8 * half, "{agents} agents reach to {far} of {half}");
@@ -28,7 +29,7 @@ fn section_5_1_1_simple_spread() {
     let task = TaskConfig::simple_spread(1, Spawn::Uniform);
     assert_eq!(task.action_heads(), [5]);
     for (action, direction) in [(0, [0.0, 0.0]), (1, [1.0, 0.0]), (2, [-1.0, 0.0]), (3, [0.0, 1.0]), (4, [0.0, -1.0])] {
-        let mut env = Spread::from_state(&task, &[0.0; 2], &[0.0; 2], &[1.0, 1.0]).unwrap();
+        let mut env = env_from_state(&task, &[0.0; 2], &[0.0; 2], &[1.0, 1.0]).unwrap();
         env.set_goals(&[0]).unwrap();
         env.step(&[action], &mut [0.0]).unwrap();
         let moved: Vec<f32> = env.positions().iter().map(|x| if *x == 0.0 { 0.0 } else { x.signum() }).collect();
@@ -36,7 +37,7 @@ fn section_5_1_1_simple_spread() {
     }
     // "They will bounce off each other."
     let task = TaskConfig::simple_spread(2, Spawn::Uniform);
-    let mut env = Spread::from_state(&task, &[0.0, 0.0, 0.15, 0.0], &[0.0; 4], &[1.0, 1.0, -1.0, 1.0]).unwrap();
+    let mut env = env_from_state(&task, &[0.0, 0.0, 0.15, 0.0], &[0.0; 4], &[1.0, 1.0, -1.0, 1.0]).unwrap();
     env.set_goals(&[0, 1]).unwrap();
     env.step(&[0, 0], &mut [0.0; 2]).unwrap();
     let at = env.positions();
@@ -50,7 +51,7 @@ fn section_5_1_2_push_ball() {
         assert_eq!((task.side * task.side, task.horizon), (area, horizon), "{agents} agents");
         assert_eq!((task.balls(), task.stages().len()), (agents, 2), "N balls; first the ball, then the landmark");
         let env = new_env(&task, (0..2).map(stream), false).unwrap();
-        assert_eq!(env.landmarks().len(), 2 * agents * 2);
+        assert_eq!(env.statics().get(LANDMARKS).len(), 2 * agents * 2);
     }
     // "Breaks this M-stage goal assignment into M independent tasks": a decision and a cost of its own per stage.
     let (trajectories, ..) = run(&small_task(TaskName::PushBall, ExecutorKind::Local, 4, 1));
@@ -66,7 +67,7 @@ fn section_5_1_3_drones() {
         assert_eq!((task.horizon, task.drones().unwrap().physics_hz, task.dims()), (120, 120, 3));
         assert_eq!(task.action_heads(), [3, 3, 3], "forward, backward, stop along each axis");
         let mut env = new_env(&task, (0..50).map(stream), false).unwrap();
-        for points in [positions(&*env, &task), env.landmarks().to_vec()] {
+        for points in [env.positions(), env.statics().get(LANDMARKS).to_vec()] {
             for point in points.chunks(3) {
                 assert!(point[0].abs() <= 1.5 && point[1].abs() <= 1.5 && (point[2] - 1.5).abs() < 1e-6, "{point:?}");
             }
@@ -92,7 +93,7 @@ fn section_5_2_success_is_the_share_of_landmarks_reached_at_the_end_over_100_epi
     let task = TaskConfig { horizon: 1, ..TaskConfig::simple_spread(4, Spawn::Uniform) };
     // Landmarks 0 to 2 are covered, two of them by agents that were sent elsewhere.
     let landmarks = [0.0, 0.0, 2.0, 0.0, 4.0, 0.0, 9.0, 0.0];
-    let mut env = Spread::from_state(&task, &[0.1, 0.0, 2.1, 0.0, 4.1, 0.0, 6.0, 0.0], &[0.0; 8], &landmarks).unwrap();
+    let mut env = env_from_state(&task, &[0.1, 0.0, 2.1, 0.0, 4.1, 0.0, 6.0, 0.0], &[0.0; 8], &landmarks).unwrap();
     env.set_goals(&[0, 2, 1, 3]).unwrap();
     env.step(&[0; 4], &mut [0.0; 4]).unwrap();
     assert_eq!(env.scores()[0][SUCCESS_RATE], 0.75);

@@ -7,7 +7,7 @@ use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::task::{RewardConfig, Spawn, TaskConfig, TaskSettings};
 use magex_core::trajectory::Trajectory;
-use magex_env::{Env as _, Spread};
+use magex_env::env_from_state;
 use magex_learner::train::gae::Gae;
 use magex_nets::commander::Team;
 use magex_nets::ops::{GraphBlock, GraphNoise, graph_block};
@@ -162,7 +162,7 @@ fn equation_5_the_reward_of_an_agent_is_bonus_minus_distance_minus_collisions() 
         TaskSettings::SimpleSpread(RewardConfig { bonus: 1.5, distance: 2.0, collision: 0.7, distance_unit: 4.0 });
     // Agent 0 on its landmark, agents 1 and 2 on their way into each other and away from theirs.
     let (start, landmarks) = ([0.0, 0.0, 2.0, 0.0, 2.3, 0.0], [0.1, 0.0, 4.0, 0.0, 2.0, 3.0]);
-    let mut env = Spread::from_state(&task, &start, &[0.0, 0.0, 1.0, 0.0, -1.0, 0.0], &landmarks).unwrap();
+    let mut env = env_from_state(&task, &start, &[0.0, 0.0, 1.0, 0.0, -1.0, 0.0], &landmarks).unwrap();
     env.set_goals(&[0, 1, 2]).unwrap();
     let mut rewards = [0.0; 3];
     env.step(&[0, 0, 0], &mut rewards).unwrap();

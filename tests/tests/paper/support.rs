@@ -7,9 +7,7 @@ use magex_core::ids::{RunId, Shard};
 use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
-use magex_core::task::TaskConfig;
 use magex_core::trajectory::{ShardResult, Trajectory};
-use magex_env::Env;
 use magex_learner::collector::Collector;
 use magex_learner::run_events::{CollectError, StopReason};
 use magex_learner::train::learned::{Learned, Network};
@@ -44,7 +42,7 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
     let mappo = Mappo::new(config).unwrap();
     let n = config.task.agents;
     let mut params = ParamBuilder::with(actor(&mappo).tensors().unwrap());
-    let network = executor::build(&config.executor, mappo.spec(), n, 5, 0.01, &mut params).unwrap();
+    let network = executor::build(&config.executor, mappo.spec(), 5, 0.01, &mut params).unwrap();
     let statics = Statics::landmarks(n, 2, (0..2 * n).map(|k| 0.3 * k as f32).collect());
     let goals: Vec<u32> = (0..n as u32).collect();
     let velocities = vec![0.0; positions.len()];
@@ -72,12 +70,6 @@ pub(crate) fn scores(commander: &Commander, team: &Team<'_>) -> Vec<f32> {
 
 pub(crate) fn stream(k: u32) -> Stream {
     Key::new(7, Purpose::Spawn, &[k]).stream()
-}
-
-pub(crate) fn positions(env: &dyn Env, task: &TaskConfig) -> Vec<f32> {
-    let mut out = vec![0.0; env.episodes() * (task.agents + task.balls()) * task.dims()];
-    env.write_positions(&mut out).unwrap();
-    out
 }
 
 /// A collector that keeps what was collected.

@@ -1,14 +1,14 @@
 //! The configuration as it is written: TOML in which nearly every key may be missing.
 
-use super::{CollectConfig, CommanderConfig, ConfigError, ExecutorConfig, MappoConfig, RunConfig, RunSection};
+use super::{CollectConfig, ConfigError, RunConfig};
 use crate::error::FieldError;
-use crate::task::{NOT_ZERO, RawTask};
+use crate::task::{self, NOT_ZERO};
 use crate::toml_table;
 use serde::Deserialize;
 use toml::Table;
 
 /// Keys that had another name: the old one and the present one. The old one is refused, naming the present one.
-pub const RENAMED: &[(&str, &str)] = &[
+pub(super) const RENAMED: &[(&str, &str)] = &[
     ("mappo.chunk", "mappo.chunk_length"),
     ("mappo.minibatch", "mappo.minibatch_size"),
     ("mappo.clip", "mappo.clip_epsilon"),
@@ -48,44 +48,27 @@ impl Default for RawCollect {
     }
 }
 
-/// A configuration whose keys and types are known to be right; ranges are not checked and derived defaults not filled in.
-pub(super) struct RawRunConfig {
-    run: RunSection,
-    task: Option<RawTask>,
-    executor: ExecutorConfig,
-    commander: CommanderConfig,
-    collect: RawCollect,
-    mappo: MappoConfig,
-}
-
-impl RawRunConfig {
-    pub(super) fn from_toml(text: &str) -> Result<Self, ConfigError> {
-        let file: Table = toml::from_str(text).map_err(|e| ConfigError::Syntax(e.to_string().trim().to_owned()))?;
-        refuse_renamed(&file)?;
-        let sections: Sections = toml_table::read("", file)?;
-        Ok(Self {
-            run: toml_table::read("run", sections.run)?,
-            task: sections.task.map(RawTask::read).transpose()?,
-            executor: toml_table::read("executor", sections.executor)?,
-            commander: toml_table::read("commander", sections.commander)?,
-            collect: toml_table::read("collect", sections.collect)?,
-            mappo: toml_table::read("mappo", sections.mappo)?,
-        })
-    }
-
-    /// Fills in the defaults that are derived from other values.
-    pub(super) fn resolve(self) -> Result<RunConfig, FieldError> {
-        let Self { run, task, executor, commander, collect, mappo } = self;
-        let task = task.map_or_else(|| Ok(RunConfig::default().task), RawTask::resolve)?;
-        let shards_per_iteration = collect.shards_per_iteration;
-        let episodes_per_iteration = match collect.episodes_per_iteration {
-            Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO)),
-            Some(episodes) => episodes,
-            None => super::derived_episodes(task.agents, shards_per_iteration),
-        };
-        let collect = CollectConfig { episodes_per_iteration, shards_per_iteration };
-        Ok(RunConfig { run, task, executor, commander, collect, mappo })
-    }
+/// The configuration of a file; missing values are defaults or derived from others. Ranges are not checked.
+pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
+    let file: Table = toml::from_str(text).map_err(|e| ConfigError(e.to_string().trim().to_owned()))?;
+    refuse_renamed(&file)?;
+    let sections: Sections = toml_table::read("", file)?;
+    let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
+    let collect: RawCollect = toml_table::read("collect", sections.collect)?;
+    let mut config = RunConfig {
+        run: toml_table::read("run", sections.run)?,
+        task,
+        executor: toml_table::read("executor", sections.executor)?,
+        commander: toml_table::read("commander", sections.commander)?,
+        collect: CollectConfig { episodes_per_iteration: 0, shards_per_iteration: collect.shards_per_iteration },
+        mappo: toml_table::read("mappo", sections.mappo)?,
+    };
+    config.collect.episodes_per_iteration = match collect.episodes_per_iteration {
+        Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO).into()),
+        Some(episodes) => episodes,
+        None => config.derived_episodes(),
+    };
+    Ok(config)
 }
 
 fn refuse_renamed(file: &Table) -> Result<(), FieldError> {

@@ -1,3 +1,4 @@
+use super::raw::RENAMED;
 use super::*;
 use crate::task::TaskName;
 

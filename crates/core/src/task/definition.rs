@@ -1,13 +1,13 @@
 //! What a task has to say about itself: one value per task, from which everything else is derived.
 
 use super::{ActionCode, Observation, Stage, TaskConfig, TaskName, TaskSettings};
-use crate::error::{FieldError, check_range};
+use crate::error::FieldError;
 use crate::statics::StaticSpec;
 
 /// A task. Its file (`task/<name>.rs`) holds this value, the task's own settings and their validation.
-pub(super) struct Definition {
+pub struct Definition {
     /// Name for people.
-    pub(super) title: &'static str,
+    pub title: &'static str,
     /// Key of the task's own settings: `[task.<section>]`.
     pub(super) section: &'static str,
     /// D: space dimensions of positions.
@@ -17,17 +17,16 @@ pub(super) struct Definition {
     /// X: further numbers of an agent's state.
     pub(super) agent_state: usize,
     /// Whether agents can crash and then are out of the episode.
-    pub(super) crashes: bool,
+    pub crashes: bool,
     pub(super) action_code: ActionCode,
     /// Assignment problems of an episode, in order.
     pub(super) stages: &'static [Stage],
-    /// Static arrays of an episode.
     pub(super) statics: fn(&TaskConfig) -> Vec<StaticSpec>,
     pub(super) observation: Observation,
     /// Radius that a landmark is drawn with, world units.
-    pub(super) landmark_radius: f32,
+    pub landmark_radius: f32,
     /// Seconds per joint step.
-    pub(super) step_seconds: f32,
+    pub step_seconds: f32,
     /// Default side of the map for N agents, world units.
     pub(super) side: fn(usize) -> f32,
     /// Default steps per episode for N agents and a side.
@@ -42,7 +41,6 @@ pub(super) struct Definition {
     pub(super) validate: fn(&TaskConfig) -> Result<(), FieldError>,
 }
 
-/// Steps rounded up to tens.
 pub(super) fn up_to_tens(steps: f32) -> u32 {
     (steps / 10.0).ceil() as u32 * 10
 }
@@ -50,11 +48,6 @@ pub(super) fn up_to_tens(steps: f32) -> u32 {
 /// A task whose settings are those of another one.
 pub(super) fn wrong_task(task: &TaskConfig, wanted: TaskName) -> FieldError {
     FieldError::new("task.name", format!("{} is not {wanted}", task.name))
-}
-
-/// Ranges of reward coefficients.
-pub(super) fn coefficients(section: &str, values: &[(&str, f32)]) -> Result<(), FieldError> {
-    values.iter().try_for_each(|&(name, value)| check_range(format!("{section}.{name}"), value, 0.0, 1000.0))
 }
 
 /// Random sequential placement of discs jams near 0.547 of the area; half of that is quick to sample.

@@ -1,8 +1,9 @@
 //! The drone task as data.
 
-use super::definition::{Definition, coefficients, fits, wrong_task};
+use super::definition::{Definition, fits, wrong_task};
 use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
-use crate::error::{FieldError, check_range};
+use crate::error::FieldError;
+use crate::section::section;
 use crate::toml_table;
 use serde::{Deserialize, Serialize};
 
@@ -19,45 +20,30 @@ pub enum Downwash {
     Off,
 }
 
-/// `[task.drones]`: physics and reward of the drone task.
-/// r = progress · (d − d') + bonus · 1\[d' ≤ 0.15\] − crash · 1\[crashed now\] − proximity · max(0, 1 − d_min / proximity_radius)
-/// − tilt · max(0, 1 − cos(tilt angle) / cos 45°).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DroneConfig {
-    /// Physics and controller steps per second, a multiple of 30 (a command lasts 1/30 s).
-    pub physics_hz: u32,
-    /// Closest that drones, and landmarks, start to one another.
-    pub spacing: f32,
-    /// How a drone's wash presses on the drones below it.
-    pub downwash: Downwash,
-    /// Paid per metre of way made good.
-    pub progress: f32,
-    /// Paid on every step within 0.15 of the landmark.
-    pub bonus: f32,
-    /// Charged once for crashing.
-    pub crash: f32,
-    /// Charged per step at zero distance from another drone, less with the distance.
-    pub proximity: f32,
-    /// Distance from which proximity costs nothing, metres.
-    pub proximity_radius: f32,
-    /// Charged per step for a tilt of 90°, less with the angle, nothing up to 45°: a drone that is asked for too much tumbles.
-    pub tilt: f32,
-}
-
-impl Default for DroneConfig {
-    fn default() -> Self {
-        Self {
-            physics_hz: 120,
-            spacing: 0.3,
-            downwash: Downwash::Limited,
-            progress: 2.0,
-            bonus: 0.1,
-            crash: 20.0,
-            proximity: 3.0,
-            proximity_radius: 0.3,
-            tilt: 1.0,
-        }
+section! {
+    /// `[task.drones]`: physics and reward of the drone task.
+    /// r = progress · (d − d') + bonus · 1\[d' ≤ 0.15\] − crash · 1\[crashed now\] − proximity · max(0, 1 − d_min / proximity_radius)
+    /// − tilt · max(0, 1 − cos(tilt angle) / cos 45°).
+    #[derive(Copy)]
+    DroneConfig {
+        /// Physics and controller steps per second, a multiple of 30 (a command lasts 1/30 s).
+        physics_hz: u32 = 120;
+        /// Closest that drones, and landmarks, start to one another: nearer, they would start in contact.
+        spacing: f32 = 0.3, 0.13..=10.0;
+        /// How a drone's wash presses on the drones below it.
+        downwash: Downwash = Downwash::Limited;
+        /// Paid per metre of way made good.
+        progress: f32 = 2.0, 0.0..=1000.0;
+        /// Paid on every step within 0.15 of the landmark.
+        bonus: f32 = 0.1, 0.0..=1000.0;
+        /// Charged once for crashing.
+        crash: f32 = 20.0, 0.0..=1000.0;
+        /// Charged per step at zero distance from another drone, less with the distance.
+        proximity: f32 = 3.0, 0.0..=1000.0;
+        /// Distance from which proximity costs nothing, metres.
+        proximity_radius: f32 = 0.3;
+        /// Charged per step for a tilt of 90°, less with the angle, nothing up to 45°: a drone that is asked for too much tumbles.
+        tilt: f32 = 1.0, 0.0..=1000.0;
     }
 }
 
@@ -111,16 +97,7 @@ impl TaskConfig {
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
     let d = task.drones()?;
-    coefficients(
-        "task.drones",
-        &[
-            ("progress", d.progress),
-            ("bonus", d.bonus),
-            ("crash", d.crash),
-            ("proximity", d.proximity),
-            ("tilt", d.tilt),
-        ],
-    )?;
+    d.check_ranges("task.drones")?;
     if task.spawn != Spawn::Uniform {
         let problem = format!("drones start uniform in the box, not on '{}'; use uniform", task.spawn);
         return Err(FieldError::new("task.spawn", problem));
@@ -138,8 +115,6 @@ fn validate(task: &TaskConfig) -> Result<(), FieldError> {
         );
         return Err(FieldError::new("task.drones.physics_hz", problem));
     }
-    // Closer than a collision radius each, drones would start in contact.
-    check_range("task.drones.spacing", d.spacing, 0.13, 10.0)?;
     if !(d.proximity_radius.is_finite() && d.proximity_radius > 0.0) {
         return Err(FieldError::new(
             "task.drones.proximity_radius",

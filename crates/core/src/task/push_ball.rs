@@ -1,30 +1,31 @@
 //! Push Ball as data.
 
-use super::definition::{Definition, coefficients, fits, up_to_tens, wrong_task};
+use super::definition::{Definition, fits, up_to_tens, wrong_task};
 use super::{ActionCode, Frame, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
-use crate::error::{FieldError, check_range};
+use crate::error::FieldError;
+use crate::section::section;
 use crate::toml_table;
-use serde::{Deserialize, Serialize};
 
-/// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + turn_length · θ ·
-/// min(1, d_bl / 0.3), d_ab the distance agent–ball, d_bl ball–landmark, θ the angle between the two legs:
-/// r = progress · (Φ' − Φ) + bonus · 1\[d_bl ≤ 0.3\] − distance · (d_ab + d_bl).
-///
-/// The authors' reward is progress = 0, bonus = 1, distance = 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct PushBallConfig {
-    /// Paid per unit of way made good.
-    pub progress: f32,
-    /// World units per radian that the ball must be walked around.
-    pub turn_length: f32,
-    /// Paid on every step on which the ball is within 0.3 of its landmark.
-    pub bonus: f32,
-    /// Charged per unit of distance left, on every step.
-    pub distance: f32,
-    /// Share of the training episodes in which agents start exactly in line with their balls, on the landmarks' side: starts
-    /// that random positions never show, and fixed layouts do.
-    pub start_in_line_fraction: f32,
+section! {
+    /// `[task.push_ball]`: reward and training of Push Ball. With Φ = −(path + 2 · d_bl), path = max(0, d_ab − 0.25) + turn_length · θ ·
+    /// min(1, d_bl / 0.3), d_ab the distance agent–ball, d_bl ball–landmark, θ the angle between the two legs:
+    /// r = progress · (Φ' − Φ) + bonus · 1\[d_bl ≤ 0.3\] − distance · (d_ab + d_bl).
+    ///
+    /// The authors' reward is progress = 0, bonus = 1, distance = 1.
+    #[derive(Copy)]
+    PushBallConfig {
+        /// Paid per unit of way made good.
+        progress: f32 = 2.0, 0.0..=1000.0;
+        /// World units per radian that the ball must be walked around.
+        turn_length: f32 = 0.25, 0.0..=1000.0;
+        /// Paid on every step on which the ball is within 0.3 of its landmark.
+        bonus: f32 = 0.1, 0.0..=1000.0;
+        /// Charged per unit of distance left, on every step.
+        distance: f32 = 0.0, 0.0..=1000.0;
+        /// Share of the training episodes in which agents start exactly in line with their balls, on the landmarks' side: starts
+        /// that random positions never show, and fixed layouts do.
+        start_in_line_fraction: f32 = 0.3, 0.0..=1.0;
+    }
 }
 
 impl PushBallConfig {
@@ -34,12 +35,6 @@ impl PushBallConfig {
     pub const BALL_RADIUS: f64 = 0.15;
     /// An agent touches a ball when their centres are this close.
     pub const PUSH_DISTANCE: f64 = Self::AGENT_RADIUS + Self::BALL_RADIUS;
-}
-
-impl Default for PushBallConfig {
-    fn default() -> Self {
-        Self { progress: 2.0, turn_length: 0.25, bonus: 0.1, distance: 0.0, start_in_line_fraction: 0.3 }
-    }
 }
 
 /// Closest that balls, and landmarks, start to one another.
@@ -91,11 +86,7 @@ impl TaskConfig {
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
     let p = task.push_ball()?;
-    coefficients(
-        "task.push_ball",
-        &[("progress", p.progress), ("turn_length", p.turn_length), ("bonus", p.bonus), ("distance", p.distance)],
-    )?;
-    check_range("task.push_ball.start_in_line_fraction", p.start_in_line_fraction, 0.0, 1.0)?;
+    p.check_ranges("task.push_ball")?;
     // The balls of the authors' layouts, on their longest line, in raw units apart.
     let gap = match task.agents {
         20 => 6.0 / 19.0,

@@ -1,50 +1,24 @@
 //! Simple Spread (paper, section 5.1.1) as data.
 
-use super::definition::{Definition, coefficients, fits, up_to_tens, wrong_task};
+use super::definition::{Definition, fits, up_to_tens, wrong_task};
 use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
 use crate::error::FieldError;
+use crate::section::section;
 use crate::toml_table;
-use serde::{Deserialize, Serialize};
 
-/// `[task.reward]`: coefficients of the reward (paper, eq. 5):
-/// r = bonus · 1[d ≤ 0.15] − distance · d / d_ref − collision · #{other agents closer than 0.2}.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct RewardConfig {
-    /// α: paid on every step on which the agent is within 0.15 of its goal (metric distance).
-    pub bonus: f32,
-    /// β: charged per unit of d / d_ref.
-    pub distance: f32,
-    /// γ: charged for every other agent closer than two radii.
-    pub collision: f32,
-    /// d_ref in world units.
-    pub distance_unit: f32,
-}
-
-/// `[task.reward]` as it is written: the unit of distance is the side of the map unless it is given.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct RawReward {
-    bonus: f32,
-    distance: f32,
-    collision: f32,
-    distance_unit: Option<f32>,
-}
-
-impl Default for RawReward {
-    fn default() -> Self {
-        Self { bonus: 1.0, distance: 1.0, collision: 1.0, distance_unit: None }
-    }
-}
-
-impl RawReward {
-    fn settings(self, side: f32) -> TaskSettings {
-        let Self { bonus, distance, collision, distance_unit } = self;
-        TaskSettings::SimpleSpread(RewardConfig {
-            bonus,
-            distance,
-            collision,
-            distance_unit: distance_unit.unwrap_or(side),
-        })
+section! {
+    /// `[task.reward]`: coefficients of the reward (paper, eq. 5):
+    /// r = bonus · 1[d ≤ 0.15] − distance · d / d_ref − collision · #{other agents closer than 0.2}.
+    #[derive(Copy)]
+    RewardConfig {
+        /// α: paid on every step on which the agent is within 0.15 of its goal (metric distance).
+        bonus: f32 = 1.0, 0.0..=1000.0;
+        /// β: charged per unit of d / d_ref.
+        distance: f32 = 1.0, 0.0..=1000.0;
+        /// γ: charged for every other agent closer than two radii.
+        collision: f32 = 1.0, 0.0..=1000.0;
+        /// d_ref in world units. Default: the side of the map.
+        distance_unit: f32 = 1.0;
     }
 }
 
@@ -74,20 +48,24 @@ pub(super) const DEFINITION: Definition = Definition {
         _ => up_to_tens(20.0 + 10.0 * side),
     },
     layout_scale: |agents| if agents <= 20 { 1.5 } else { 2.0 },
-    default_settings: |side| RawReward::default().settings(side),
-    read_settings: |side, section| {
-        let raw: RawReward = toml_table::read("task.reward", section)?;
-        if raw.distance_unit == Some(0.0) {
+    default_settings: |side| {
+        TaskSettings::SimpleSpread(RewardConfig { distance_unit: side, ..RewardConfig::default() })
+    },
+    read_settings: |side, mut section| {
+        let given = section.contains_key("distance_unit");
+        section.entry("distance_unit").or_insert_with(|| f64::from(side).into());
+        let reward: RewardConfig = toml_table::read("task.reward", section)?;
+        if given && reward.distance_unit == 0.0 {
             return Err(FieldError::new("task.reward.distance_unit", super::NOT_ZERO));
         }
-        Ok(raw.settings(side))
+        Ok(TaskSettings::SimpleSpread(reward))
     },
     validate,
 };
 
 fn validate(task: &TaskConfig) -> Result<(), FieldError> {
     let r = task.reward()?;
-    coefficients("task.reward", &[("bonus", r.bonus), ("distance", r.distance), ("collision", r.collision)])?;
+    r.check_ranges("task.reward")?;
     if !(r.distance_unit.is_finite() && r.distance_unit > 0.0) {
         return Err(FieldError::new("task.reward.distance_unit", format!("{} must be positive", r.distance_unit)));
     }

@@ -17,29 +17,19 @@ pub enum Spawn {
 
 impl TryFrom<String> for Spawn {
     type Error = UnknownName;
-    fn try_from(text: String) -> Result<Self, UnknownName> {
-        let unknown = || UnknownName {
-            what: "spawn mode",
-            name: text.clone(),
-            choices: "uniform, lines, lines-0..3, authors or authors-0..3",
+    fn try_from(name: String) -> Result<Self, UnknownName> {
+        let layout = |prefix: &str| match name.strip_prefix(prefix)?.as_bytes() {
+            [] => Some(None),
+            [b'-', layout @ b'0'..=b'3'] => Some(Some(layout - b'0')),
+            _ => None,
         };
-        let layout = |suffix: &str| match suffix {
-            "" => Ok(None),
-            "-0" => Ok(Some(0)),
-            "-1" => Ok(Some(1)),
-            "-2" => Ok(Some(2)),
-            "-3" => Ok(Some(3)),
-            _ => Err(unknown()),
+        let spawn = match layout("lines") {
+            _ if name == "uniform" => Some(Self::Uniform),
+            Some(fixed) => Some(Self::Lines(fixed)),
+            None => layout("authors").map(Self::Authors),
         };
-        if text == "uniform" {
-            Ok(Self::Uniform)
-        } else if let Some(rest) = text.strip_prefix("lines") {
-            layout(rest).map(Self::Lines)
-        } else if let Some(rest) = text.strip_prefix("authors") {
-            layout(rest).map(Self::Authors)
-        } else {
-            Err(unknown())
-        }
+        let choices = "uniform, lines, lines-0..3, authors or authors-0..3";
+        spawn.ok_or(UnknownName { what: "spawn mode", name, choices })
     }
 }
 
@@ -52,17 +42,20 @@ impl std::str::FromStr for Spawn {
 
 impl From<Spawn> for String {
     fn from(spawn: Spawn) -> Self {
-        let suffix = |layout: Option<u8>| layout.map(|k| format!("-{k}")).unwrap_or_default();
-        match spawn {
-            Spawn::Uniform => "uniform".into(),
-            Spawn::Lines(layout) => format!("lines{}", suffix(layout)),
-            Spawn::Authors(layout) => format!("authors{}", suffix(layout)),
-        }
+        spawn.to_string()
     }
 }
 
 impl std::fmt::Display for Spawn {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&String::from(*self))
+        let (name, layout) = match self {
+            Self::Uniform => ("uniform", None),
+            Self::Lines(layout) => ("lines", *layout),
+            Self::Authors(layout) => ("authors", *layout),
+        };
+        match layout {
+            Some(layout) => write!(f, "{name}-{layout}"),
+            None => f.write_str(name),
+        }
     }
 }

@@ -22,7 +22,7 @@ fn every_task_has_the_sizes_of_the_paper_and_refuses_the_settings_of_others() {
     for name in [TaskName::SimpleSpread, TaskName::PushBall, TaskName::Drones] {
         let task = TaskConfig::of(name, 4, Spawn::Uniform);
         let keys: Table = toml::from_str(&toml::to_string(&task).unwrap()).unwrap();
-        let read = |keys: &Table| RawTask::read(keys.clone()).and_then(RawTask::resolve);
+        let read = |keys: &Table| super::read(keys.clone());
         assert_eq!(read(&keys).unwrap(), task);
         assert_eq!(task.shape(3).goals_per_agent, task.stages().len());
         for (owner, section, key) in [
@@ -49,7 +49,7 @@ fn other_than(name: TaskName) -> TaskName {
 fn a_zero_is_not_a_default() {
     let read = |text: &str| {
         let keys: Table = toml::from_str(&format!("agents = 5\nspawn = 'uniform'\n{text}")).unwrap();
-        RawTask::read(keys).and_then(RawTask::resolve)
+        super::read(keys)
     };
     assert_eq!(read("name = 'push-ball'").unwrap(), TaskConfig::of(TaskName::PushBall, 5, Spawn::Uniform));
     for key in ["side", "horizon", "layout_scale"] {

@@ -1,10 +1,10 @@
 //! A hand-written pilot: what a drone that knows its landmark can reach without learning.
 
-use crate::controller::interface::Controller;
+use super::{Controller, check};
 use crate::drones::{ACCELERATION, MOST_SPEED};
-use crate::error::{EnvError, check_len};
+use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;
-use magex_core::task::DroneConfig;
+use magex_core::task::{DroneConfig, Spawn, TaskConfig, TaskName};
 
 /// Wanted target velocity per metre of way, 1/s. The drone lags its target by 0.14 s of velocity control (mass over the
 /// D gain) and 0.14 s of attitude control, whose torques saturate: a pilot that brakes at the last moment tumbles.
@@ -14,30 +14,20 @@ const APPROACH: f64 = 2.0;
 /// 2 m/s, other drones ignored. Ties go to stop. Actions are 0 forward, 1 stop, 2 backward.
 #[derive(Debug, Clone)]
 pub struct DroneScript {
-    agents: usize,
+    task: TaskConfig,
 }
 
 impl DroneScript {
     /// For teams of N drones.
     pub fn new(agents: usize) -> Self {
-        Self { agents }
+        Self { task: TaskConfig::of(TaskName::Drones, agents, Spawn::Uniform) }
     }
 }
 
 impl Controller for DroneScript {
-    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), EnvError> {
-        let (agents, goals, landmarks) = (self.agents, state.goals, state.landmarks());
-        let states = state.positions.len() / (3 * agents).max(1);
-        let numbers = states * agents;
-        check_len("positions", state.positions.len(), 3 * numbers)?;
-        check_len("actions", actions.len(), 3 * numbers)?;
-        check_len("agent_state", state.agent_state.len(), DroneConfig::AGENT_STATE * numbers)?;
-        check_len("landmarks", landmarks.len(), 3 * goals.len())?;
-        // Q episodes, at least one.
-        check_len("goals", goals.len(), goals.len().max(1).next_multiple_of(agents.max(1)))?;
-        if let Some(place) = goals.iter().position(|&goal| goal as usize >= agents) {
-            return Err(EnvError::Goal { place, goal: goals[place], landmarks: agents });
-        }
+    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), FieldError> {
+        check(&self.task, state, actions)?;
+        let (agents, goals, landmarks) = (self.task.agents, state.goals, state.landmarks());
         for (k, actions) in actions.chunks_exact_mut(3).enumerate() {
             let of_episode = k % goals.len();
             let landmark = 3 * (of_episode / agents * agents + goals[of_episode] as usize);

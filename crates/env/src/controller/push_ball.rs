@@ -4,12 +4,13 @@
 //! happens does not: of all sequences of three actions, each held for two steps, the agent starts the one after which its
 //! ball would come to rest best, and itself be best placed to push on.
 
-use crate::controller::interface::Controller;
-use crate::error::{EnvError, check_len};
+use super::{Controller, check};
 use crate::particles::physics::{Bodies, Forces, Motion, Pair, Physics, pack};
+use crate::push_ball::REACHED;
 use crate::push_ball::law::angle;
-use crate::push_ball::{AGENT_RADIUS, BALL_RADIUS, PUSH_DISTANCE, REACHED};
+use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;
+use magex_core::task::{PushBallConfig, Spawn, TaskConfig, TaskName};
 
 /// Sequences tried at once: 5³, filled up to whole registers.
 const LANES: usize = 128;
@@ -27,35 +28,21 @@ const BALL_WEIGHT: f32 = 3.0;
 /// Chooses an action for every agent of S states of Push Ball. Ties go to the lower action.
 #[derive(Debug)]
 pub struct PushBallScript {
-    agents: usize,
+    task: TaskConfig,
     model: Model,
 }
 
 impl PushBallScript {
     /// For teams of N agents.
     pub fn new(agents: usize) -> Self {
-        Self { agents, model: Model::new() }
+        Self { task: TaskConfig::of(TaskName::PushBall, agents, Spawn::Uniform), model: Model::new() }
     }
 }
 
 impl Controller for PushBallScript {
-    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), EnvError> {
-        let (n, landmarks) = (self.agents, state.landmarks());
-        let episodes = state.goals.len() / (2 * n).max(1);
-        let states = actions.len() / n.max(1);
-        check_len("goals", state.goals.len(), 2 * n * episodes.max(usize::from(states > 0)))?;
-        check_len("landmarks", landmarks.len(), 2 * n * episodes)?;
-        check_len("actions", actions.len(), n * states.next_multiple_of(episodes.max(1)))?;
-        check_len("positions", state.positions.len(), 4 * n * states)?;
-        check_len("velocities", state.velocities.len(), 4 * n * states)?;
-        check_len("agent_state", state.agent_state.len(), 0)?;
-        if let Some(place) = state.goals.iter().position(|&goal| goal as usize >= n) {
-            let goal = state.goals[place];
-            return Err(match place % 2 {
-                0 => EnvError::Ball { place, goal, balls: n },
-                _ => EnvError::Goal { place, goal, landmarks: n },
-            });
-        }
+    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), FieldError> {
+        let episodes = check(&self.task, state, actions)?;
+        let (n, landmarks) = (self.task.agents, state.landmarks());
         for (s, actions) in actions.chunks_exact_mut(n.max(1)).enumerate() {
             let (bodies, goals) = (4 * n * s..4 * n * (s + 1), 2 * n * (s % episodes)..);
             let world =
@@ -97,9 +84,6 @@ impl Bodies<f32> for Kinds {
     fn pair(&self, i: usize, j: usize) -> Pair<f32> {
         self.pairs[usize::from(self.ball[i]) + usize::from(self.ball[j])]
     }
-    fn inverse_mass(&self, _: usize) -> f32 {
-        1.0
-    }
     /// The agent and its ball; what else is around goes on as it goes.
     fn movable(&self, i: usize) -> bool {
         i < 2
@@ -124,7 +108,8 @@ impl Model {
     fn new() -> Self {
         let physics = Physics::standard();
         let pair = |touch| Pair::equal(&physics, touch);
-        let pairs = [pair(2.0 * AGENT_RADIUS), pair(PUSH_DISTANCE), pair(2.0 * BALL_RADIUS)];
+        let (agent, ball) = (PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS);
+        let pairs = [pair(2.0 * agent), pair(PushBallConfig::PUSH_DISTANCE), pair(2.0 * ball)];
         Self {
             physics,
             kinds: Kinds { pairs, ball: Vec::new() },
@@ -226,7 +211,7 @@ impl Model {
             let stop = sx.mul_add(sx, sy * sy).sqrt();
             let theta = angle(ax.mul_add(bx, ay * by), ax.mul_add(by, -(ay * bx)), d_ab * d_bl);
             let fade = (stop / REACHED as f32).min(1.0);
-            let gap = (d_ab - PUSH_DISTANCE as f32).max(0.0);
+            let gap = (d_ab - PushBallConfig::PUSH_DISTANCE as f32).max(0.0);
             *cost += fade.mul_add(ARC.mul_add(theta, gap), BALL_WEIGHT * stop);
         }
     }

@@ -1,9 +1,10 @@
 //! The yardstick of Simple Spread: full thrust towards the goal, braking in time.
 
-use crate::controller::interface::Controller;
-use crate::error::{EnvError, check_len};
+use super::{Controller, check};
 use crate::particles::physics::Physics;
+use magex_core::error::FieldError;
 use magex_core::joint_state::JointState;
+use magex_core::task::{Spawn, TaskConfig};
 
 /// Chooses for every agent the action after which it would come to rest nearest to its goal, other agents ignored.
 ///
@@ -11,33 +12,28 @@ use magex_core::joint_state::JointState;
 /// dt · v' · keep / (1 − keep) = 3 dt · v', so it stops at p + 0.4 v'. Ties go to the lower action.
 #[derive(Debug, Clone)]
 pub struct SpreadScript {
-    agents: usize,
+    task: TaskConfig,
 }
 
 impl SpreadScript {
     /// For teams of N agents.
     pub fn new(agents: usize) -> Self {
-        Self { agents }
+        Self { task: TaskConfig::simple_spread(agents, Spawn::Uniform) }
     }
 }
 
 impl Controller for SpreadScript {
-    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), EnvError> {
-        let (agents, numbers) = (self.agents, state.goals.len());
-        let (positions, velocities, landmarks) = (state.positions, state.velocities, state.landmarks());
-        check_len("positions", positions.len(), 2 * numbers)?;
-        check_len("velocities", velocities.len(), 2 * numbers)?;
-        check_len("landmarks", landmarks.len(), 2 * numbers)?;
-        check_len("actions", actions.len(), numbers)?;
-        if let Some(place) = state.goals.iter().position(|&goal| goal as usize >= agents) {
-            return Err(EnvError::Goal { place, goal: state.goals[place], landmarks: agents });
-        }
+    fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), FieldError> {
+        check(&self.task, state, actions)?;
+        let (agents, positions, velocities) = (self.task.agents, state.positions, state.velocities);
+        let landmarks = state.landmarks();
         let physics = Physics::<f32>::standard();
         let stop = physics.dt / (1.0 - physics.keep);
         // Where the agent stops without thrust is off by e; an action moves that point by `push` along one axis.
         let (glide, push) = (stop * physics.keep, stop * physics.dt * physics.sensitivity);
         for (k, action) in actions.iter_mut().enumerate() {
-            let goal = k / agents * agents + state.goals[k] as usize;
+            let of_episode = k % state.goals.len();
+            let goal = of_episode / agents * agents + state.goals[of_episode] as usize;
             let e = [0, 1].map(|d| positions[2 * k + d] + glide * velocities[2 * k + d] - landmarks[2 * goal + d]);
             *action = nearest_stop(e, push);
         }

@@ -1,59 +1,41 @@
 //! The cascaded PID controller of gym-pybullet-drones (`DSLPIDControl`, CF2X gains): position and velocity to rpm.
 
+use super::constants::cf2x;
 use super::linalg::{Mat3, V3, add, cross, dot, norm, roll_pitch_yaw, scale, sub, times};
-use super::model::Craft;
+use super::model::{Craft, State};
 
-/// Gains and limits. Forces in N, torques in units of the motors' PWM.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gains {
-    /// N per m.
-    pub p_force: [f64; 3],
-    /// N per m s.
-    pub i_force: [f64; 3],
-    /// N per m/s.
-    pub d_force: [f64; 3],
-    /// PWM per unit of attitude error.
-    pub p_torque: [f64; 3],
-    /// PWM per unit of attitude error and second.
-    pub i_torque: [f64; 3],
-    /// PWM per rad/s.
-    pub d_torque: [f64; 3],
-    /// Bound of the position integral, m s; every axis is also bounded by the first.
-    pub most_position_integral: [f64; 3],
-    /// Bound of the attitude integral, rad s; every axis is also bounded by the last.
-    pub most_attitude_integral: [f64; 3],
-    /// Bound of the torques, PWM.
-    pub most_torque: f64,
-    /// rpm per PWM.
-    pub rpm_per_pwm: f64,
-    /// rpm at PWM 0.
-    pub rpm_at_zero: f64,
-    /// Least PWM.
-    pub least_pwm: f64,
-    /// Largest PWM.
-    pub most_pwm: f64,
-    /// Torque of each axis on each motor.
-    pub mixer: [[f64; 3]; 4],
-}
-
-impl Gains {
-    /// The reference's gains for the Crazyflie 2.X.
-    pub const CF2X: Self = Self {
-        p_force: [0.4, 0.4, 1.25],
-        i_force: [0.05, 0.05, 0.05],
-        d_force: [0.2, 0.2, 0.5],
-        p_torque: [70_000.0, 70_000.0, 60_000.0],
-        i_torque: [0.0, 0.0, 500.0],
-        d_torque: [20_000.0, 20_000.0, 12_000.0],
-        most_position_integral: [2.0, 2.0, 0.15],
-        most_attitude_integral: [1.0, 1.0, 1500.0],
-        most_torque: 3200.0,
-        rpm_per_pwm: 0.2685,
-        rpm_at_zero: 4070.3,
-        least_pwm: 20_000.0,
-        most_pwm: 65_535.0,
-        mixer: [[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]],
-    };
+cf2x! {
+    /// Gains and limits. Forces in N, torques in units of the motors' PWM.
+    Gains {
+        /// N per m.
+        p_force: [f64; 3] = [0.4, 0.4, 1.25];
+        /// N per m s.
+        i_force: [f64; 3] = [0.05, 0.05, 0.05];
+        /// N per m/s.
+        d_force: [f64; 3] = [0.2, 0.2, 0.5];
+        /// PWM per unit of attitude error.
+        p_torque: [f64; 3] = [70_000.0, 70_000.0, 60_000.0];
+        /// PWM per unit of attitude error and second.
+        i_torque: [f64; 3] = [0.0, 0.0, 500.0];
+        /// PWM per rad/s.
+        d_torque: [f64; 3] = [20_000.0, 20_000.0, 12_000.0];
+        /// Bound of the position integral, m s; every axis is also bounded by the first.
+        most_position_integral: [f64; 3] = [2.0, 2.0, 0.15];
+        /// Bound of the attitude integral, rad s; every axis is also bounded by the last.
+        most_attitude_integral: [f64; 3] = [1.0, 1.0, 1500.0];
+        /// Bound of the torques, PWM.
+        most_torque: f64 = 3200.0;
+        /// rpm per PWM.
+        rpm_per_pwm: f64 = 0.2685;
+        /// rpm at PWM 0.
+        rpm_at_zero: f64 = 4070.3;
+        /// Least PWM.
+        least_pwm: f64 = 20_000.0;
+        /// Largest PWM.
+        most_pwm: f64 = 65_535.0;
+        /// Torque of each axis on each motor.
+        mixer: [[f64; 3]; 4] = [[-0.5, -0.5, -1.0], [-0.5, 0.5, 1.0], [0.5, 0.5, -1.0], [0.5, -0.5, 1.0]];
+    }
 }
 
 /// What the controller remembers; all zero at the start.
@@ -67,15 +49,11 @@ pub struct Memory {
     pub last_angles: [f64; 3],
 }
 
-/// What the controller sees and what it is asked for.
+/// What the controller sees (it computes angular velocities itself) and what it is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Request {
-    /// m.
-    pub position: [f64; 3],
-    /// Unit quaternion.
-    pub attitude: [f64; 4],
-    /// m/s.
-    pub velocity: [f64; 3],
+    /// The present state.
+    pub state: State,
     /// m.
     pub target_position: [f64; 3],
     /// m/s.
@@ -88,16 +66,8 @@ pub struct Request {
 
 impl Request {
     /// Track a velocity: the present place and the present yaw are the targets, so that only the velocity counts.
-    pub fn velocity(position: [f64; 3], attitude: [f64; 4], velocity: [f64; 3], target: [f64; 3]) -> Self {
-        Self {
-            position,
-            attitude,
-            velocity,
-            target_position: position,
-            target_velocity: target,
-            target_yaw: None,
-            target_rates: [0.0; 3],
-        }
+    pub fn velocity(state: State, target_velocity: [f64; 3]) -> Self {
+        Self { state, target_position: state.position, target_velocity, target_yaw: None, target_rates: [0.0; 3] }
     }
 }
 
@@ -117,11 +87,11 @@ pub struct Answer {
 impl Memory {
     /// One call of the controller, `dt` seconds after the previous one.
     pub fn call(&mut self, craft: &Craft, gains: &Gains, request: &Request, dt: f64) -> Answer {
-        let now = Mat3::of(request.attitude);
-        let angles = roll_pitch_yaw(request.attitude);
+        let now = Mat3::of(request.state.attitude);
+        let angles = roll_pitch_yaw(request.state.attitude);
         // Position: a force.
-        let position_error = sub(request.target_position, request.position);
-        let velocity_error = sub(request.target_velocity, request.velocity);
+        let position_error = sub(request.target_position, request.state.position);
+        let velocity_error = sub(request.target_velocity, request.state.velocity);
         let [most, _, most_z] = gains.most_position_integral;
         let integral = add(self.position_integral, scale(position_error, dt)).map(|i| i.clamp(-most, most));
         self.position_integral = [integral[0], integral[1], integral[2].clamp(-most_z, most_z)];

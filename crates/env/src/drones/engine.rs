@@ -71,7 +71,6 @@ pub(crate) struct Touch {
     pub(crate) ground: bool,
 }
 
-/// A rapier world.
 pub(crate) struct Engine {
     world: PhysicsWorld,
     bodies: Vec<RigidBodyHandle>,

@@ -5,17 +5,10 @@ use super::control::{Gains, Memory, Request};
 use super::linalg::{V3, norm, scale, sub};
 use super::model::State;
 use super::world::{Drone, Laws, World};
-use crate::env::all_covered;
 use crate::matching::maximum_matching;
-use crate::shell::Moment;
-use magex_core::metrics_table::{
-    ALL_COVERED_RATE, ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD,
-    SPAWN_SUCCESS_RATE, SUCCESS_RATE,
-};
+use crate::rules::Score;
 use magex_core::task::DroneConfig;
-use magex_core::trajectory::EpisodeMetrics;
 
-/// An episode.
 pub(super) struct Episode {
     pub(super) world: World,
     memories: Vec<Memory>,
@@ -28,7 +21,6 @@ pub(super) struct Episode {
     rpm: Vec<[f64; 4]>,
     /// First command after which the landmarks were covered, 0 while it has not happened.
     arrival: u32,
-    /// Sum of the rewards of all drones.
     reward: f64,
 }
 
@@ -60,9 +52,9 @@ impl Episode {
         }
     }
 
-    /// Share of the landmarks [N, 3] that are covered now.
-    pub(super) fn success(&self, landmarks: &[f32]) -> f32 {
-        share(covered(&self.near(landmarks)), self.world.drones.len())
+    /// Landmarks [N, 3] that are covered now.
+    pub(super) fn covered(&self, landmarks: &[f32]) -> usize {
+        self.near(landmarks).iter().filter(|drones| !drones.is_empty()).count()
     }
 
     /// Distance of a drone to its landmark, m.
@@ -86,8 +78,7 @@ impl Episode {
                 self.rpm[i] = if drone.is_out() {
                     [0.0; 4]
                 } else {
-                    let state = drone.state();
-                    let request = Request::velocity(state.position, state.attitude, state.velocity, self.targets[i]);
+                    let request = Request::velocity(drone.state(), self.targets[i]);
                     self.memories[i].call(&laws.craft, &Gains::CF2X, &request, laws.dt).rpm
                 };
             }
@@ -134,7 +125,7 @@ impl Episode {
     /// Looks at the landmarks after command number `step` (from 1).
     pub(super) fn observe(&mut self, step: u32, landmarks: &[f32]) {
         let n = self.world.drones.len();
-        if self.arrival == 0 && covered(&self.near(landmarks)) + n / 100 >= n {
+        if self.arrival == 0 && self.covered(landmarks) + n / 100 >= n {
             self.arrival = step;
         }
     }
@@ -151,7 +142,7 @@ impl Episode {
         landmarks.chunks_exact(3).map(near).collect()
     }
 
-    /// `[N, 6]`: see [`super::Drones`].
+    /// `[N, 6]`: see [`super::Flight`].
     pub(super) fn agent_state(&self) -> impl Iterator<Item = [f32; DroneConfig::AGENT_STATE]> + '_ {
         self.world.drones.iter().zip(&self.targets).map(|(drone, target)| {
             let [vx, vy, vz] = target.map(|c| c as f32);
@@ -161,23 +152,17 @@ impl Episode {
         })
     }
 
-    /// The score at a moment.
-    pub(super) fn score(&self, moment: &Moment<'_>, landmarks: &[f32]) -> EpisodeMetrics {
+    /// The score after a number of commands, at least 1.
+    pub(super) fn score(&self, commands: f64, landmarks: &[f32]) -> Score {
         let n = self.world.drones.len();
-        let near = self.near(landmarks);
-        let commands = f64::from(moment.steps.max(1));
         let crashed = self.world.drones.iter().filter(|drone| drone.is_out()).count() as f64 / n as f64;
-        let success = share(covered(&near), n);
-        EpisodeMetrics::of([
-            (SUCCESS_RATE, success),
-            (MATCHED_SUCCESS_RATE, share(maximum_matching(&near, n), n)),
-            (ALL_COVERED_RATE, all_covered(success)),
-            (SPAWN_SUCCESS_RATE, moment.spawn_success),
-            (ARRIVAL_STEP, if self.arrival > 0 { self.arrival } else { moment.horizon + 1 } as f32),
-            (COLLISIONS_PER_AGENT_STEP, (crashed / commands) as f32),
-            (COLLISION_RATE, crashed as f32),
-            (REWARD, (self.reward / (commands * n as f64)) as f32),
-        ])
+        Score {
+            matched: maximum_matching(&self.near(landmarks), n),
+            arrival: Some(self.arrival).filter(|&arrival| arrival > 0),
+            collisions: crashed / commands,
+            crashed,
+            reward: self.reward,
+        }
     }
 }
 
@@ -189,7 +174,6 @@ impl Episode {
     }
 }
 
-/// A target velocity of at most 2 m/s.
 fn limited(velocity: V3) -> V3 {
     let speed = norm(velocity);
     if speed > MOST_SPEED { scale(velocity, MOST_SPEED / speed) } else { velocity }
@@ -198,12 +182,4 @@ fn limited(velocity: V3) -> V3 {
 /// How far a tilt, given its cosine, is beyond 45°: 0 up to there, 1 at 90°.
 pub(super) fn steepness(cosine: f64) -> f64 {
     (1.0 - cosine * std::f64::consts::SQRT_2).max(0.0)
-}
-
-fn covered(near: &[Vec<u32>]) -> usize {
-    near.iter().filter(|drones| !drones.is_empty()).count()
-}
-
-fn share(count: usize, of: usize) -> f32 {
-    (count as f64 / of as f64) as f32
 }

@@ -6,71 +6,49 @@
 //! *previous* step ("lagged"), the engine's damping is linear plus quadratic, drag uses the rpm of the previous step
 //! and world-frame coefficients.
 
+use super::constants::cf2x;
 use super::linalg::{Mat3, POLE, V3, add, cross, dot, norm, product, scale, sine_of_pitch, times, unit};
 
-/// Constants of a quadrotor and of the engine it was recorded with. SI units.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Craft {
-    /// Mass in kg.
-    pub mass: f64,
-    /// Gravity in m/s².
-    pub gravity: f64,
-    /// Principal inertia in kg m², body axes.
-    pub inertia: [f64; 3],
-    /// Arm in m: the lever of the explicit variant is arm / √2.
-    pub arm: f64,
-    /// Propellers in the body frame, m.
-    pub propellers: [[f64; 3]; 4],
-    /// Thrust in N per rpm².
-    pub kf: f64,
-    /// Yaw moment in N m per rpm².
-    pub km: f64,
-    /// Sign of each motor's yaw moment.
-    pub yaw_signs: [f64; 4],
-    /// Radius of a propeller in m.
-    pub propeller_radius: f64,
-    /// Coefficient of the ground effect.
-    pub ground: f64,
-    /// Drag in N per (m/s) per (rad/s), world axes.
-    pub drag: [f64; 3],
-    /// Coefficients of the downwash.
-    pub downwash: [f64; 3],
-    /// The engine's damping of velocities in 1/s.
-    pub linear_damping: f64,
-    /// The engine's damping of angular velocities in 1/s.
-    pub angular_damping: f64,
-    /// The engine's bound on every coordinate of velocity and angular velocity, in m/s and rad/s.
-    pub most_speed: f64,
+cf2x! {
+    /// Constants of a quadrotor and of the engine it was recorded with. SI units.
+    Craft {
+        /// Mass in kg.
+        mass: f64 = 0.027;
+        /// Gravity in m/s².
+        gravity: f64 = 9.8;
+        /// Principal inertia in kg m², body axes.
+        inertia: [f64; 3] = [1.4e-5, 1.4e-5, 2.17e-5];
+        /// Arm in m: the lever of the explicit variant is arm / √2.
+        arm: f64 = 0.0397;
+        /// Propellers in the body frame, m.
+        propellers: [[f64; 3]; 4] = [[0.028, -0.028, 0.0], [-0.028, -0.028, 0.0], [-0.028, 0.028, 0.0], [0.028, 0.028, 0.0]];
+        /// Thrust in N per rpm².
+        kf: f64 = 3.16e-10;
+        /// Yaw moment in N m per rpm².
+        km: f64 = 7.94e-12;
+        /// Sign of each motor's yaw moment.
+        yaw_signs: [f64; 4] = [-1.0, 1.0, -1.0, 1.0];
+        /// Radius of a propeller in m.
+        propeller_radius: f64 = 0.0231348;
+        /// Coefficient of the ground effect.
+        ground: f64 = 11.36859;
+        /// Drag in N per (m/s) per (rad/s), world axes.
+        drag: [f64; 3] = [9.1785e-7, 9.1785e-7, 10.311e-7];
+        /// Coefficients of the downwash.
+        downwash: [f64; 3] = [2267.18, 0.16, -0.11];
+        /// The engine's damping of velocities in 1/s: Bullet's default of 0.04, stored there as f32.
+        linear_damping: f64 = 0.039_999_999_105_930_33;
+        /// The engine's damping of angular velocities in 1/s.
+        angular_damping: f64 = 0.039_999_999_105_930_33;
+        /// The engine's bound on every coordinate of velocity and angular velocity, in m/s and rad/s.
+        most_speed: f64 = 100.0;
+    }
 }
 
 impl Craft {
-    /// Crazyflie 2.X (`cf2x.urdf`), and Bullet's default damping of 0.04, stored there as f32.
-    pub const CF2X: Self = Self {
-        mass: 0.027,
-        gravity: 9.8,
-        inertia: [1.4e-5, 1.4e-5, 2.17e-5],
-        arm: 0.0397,
-        propellers: [[0.028, -0.028, 0.0], [-0.028, -0.028, 0.0], [-0.028, 0.028, 0.0], [0.028, 0.028, 0.0]],
-        kf: 3.16e-10,
-        km: 7.94e-12,
-        yaw_signs: [-1.0, 1.0, -1.0, 1.0],
-        propeller_radius: 0.0231348,
-        ground: 11.36859,
-        drag: [9.1785e-7, 9.1785e-7, 10.311e-7],
-        downwash: [2267.18, 0.16, -0.11],
-        linear_damping: 0.039_999_999_105_930_33,
-        angular_damping: 0.039_999_999_105_930_33,
-        most_speed: 100.0,
-    };
-
     /// m g, in N.
     pub fn weight(&self) -> f64 {
         self.mass * self.gravity
-    }
-
-    /// rpm of each motor at which the thrust is the weight: 14468.4 for [`Craft::CF2X`].
-    pub fn hover_rpm(&self) -> f64 {
-        libm::sqrt(self.weight() / (4.0 * self.kf))
     }
 
     /// Thrust of every motor in N.
@@ -94,14 +72,10 @@ impl Craft {
         times(scale(self.drag, -turning), velocity)
     }
 
-    /// Extra thrust of every motor in N near the ground plane z = 0; `None` for a drone on its side or upside down.
+    /// Extra thrust of every motor in N near the ground plane z = 0, given position, attitude (also as a matrix) and thrust;
+    /// `None` for a drone on its side or upside down.
     #[inline]
-    pub fn ground_effect(&self, position: [f64; 3], attitude: [f64; 4], rpm: [f64; 4]) -> Option<[f64; 4]> {
-        self.ground_effect_of(position, attitude, &Mat3::of(attitude), self.thrust(rpm))
-    }
-
-    #[inline]
-    fn ground_effect_of(&self, p: V3, q: [f64; 4], r: &Mat3, thrust: [f64; 4]) -> Option<[f64; 4]> {
+    pub fn ground_effect(&self, p: V3, q: [f64; 4], r: &Mat3, thrust: [f64; 4]) -> Option<[f64; 4]> {
         // |roll| < π/2 is R_zz > 0; |pitch| < π/2 holds short of the poles.
         if sine_of_pitch(q).abs() >= POLE || r.0[2][2] <= 0.0 {
             return None;
@@ -196,7 +170,7 @@ impl Craft {
         let mut frame = &lagged;
         if effects.ground {
             frame = &now;
-            if let Some(extra) = self.ground_effect_of(state.position, state.attitude, &now, thrust) {
+            if let Some(extra) = self.ground_effect(state.position, state.attitude, &now, thrust) {
                 let up = now.axis(2);
                 force = add(force, scale(up, total(extra)));
                 moment = add(moment, cross(now.turn(self.lever(extra)), up));
@@ -242,11 +216,6 @@ impl Craft {
             velocity,
             spin,
         }
-    }
-
-    /// One exact step.
-    pub fn step(&self, state: &State, inputs: &Inputs, effects: Effects, dt: f64) -> State {
-        self.integrate(state, &self.loads(state, inputs, effects), dt)
     }
 
     /// One step of the explicit variant (`Physics.DYN`): no engine, no damping, no lag, body rates integrated on their

@@ -2,13 +2,15 @@ use super::model::State;
 use super::world::{Crash, Drone, World};
 use super::*;
 use crate::controller::{Controller as _, DroneScript};
-use crate::env::Env as _;
+use crate::env::Env;
+use crate::tasks::starts;
 use magex_core::joint_state::JointState;
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, MATCHED_SUCCESS_RATE, REWARD, SPAWN_SUCCESS_RATE, SUCCESS_RATE,
 };
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Downwash, Spawn, TaskName, TaskSettings};
+use magex_core::trajectory::EpisodeMetrics;
 use proptest::prelude::*;
 use rapier3d::prelude::Vector;
 
@@ -27,10 +29,30 @@ fn stream(k: u32) -> Stream {
     Key::new(5, Purpose::Spawn, &[k]).stream()
 }
 
+type Drones = Env<Flight>;
+
+fn assemble(task: &TaskConfig, starts: Starts) -> Result<Drones, FieldError> {
+    let flight = Flight::new(task, &starts)?;
+    Ok(Env::new(task, starts, Box::new(flight)))
+}
+
+fn new_env(task: &TaskConfig, streams: impl Iterator<Item = Stream>) -> Result<Drones, FieldError> {
+    assemble(task, starts(task, streams, false)?)
+}
+
+fn from_state(
+    task: &TaskConfig,
+    positions: &[f32],
+    velocities: &[f32],
+    landmarks: &[f32],
+) -> Result<Drones, FieldError> {
+    assemble(task, Starts::given(task, [positions, velocities, landmarks])?)
+}
+
 /// One episode from a state, goals 0, 1, ...
 fn episode(task: &TaskConfig, positions: &[[f32; 3]], velocities: &[[f32; 3]]) -> Drones {
     let landmarks: Vec<f32> = (0..positions.len()).flat_map(|k| [k as f32, 3.0, 1.5]).collect();
-    let mut drones = Drones::from_state(task, positions.as_flattened(), velocities.as_flattened(), &landmarks).unwrap();
+    let mut drones = from_state(task, positions.as_flattened(), velocities.as_flattened(), &landmarks).unwrap();
     let goals: Vec<u32> = (0..positions.len() as u32).collect();
     drones.set_goals(&goals).unwrap();
     drones
@@ -110,7 +132,7 @@ fn actions_move_the_target_velocity_and_the_drone_follows() {
 
 /// Flies `episodes` random episodes by the scripted pilot; mean success and collision rate.
 fn scripted(task: &TaskConfig, episodes: u32) -> (Drones, [f32; 2]) {
-    let mut drones = Drones::new(task, (0..episodes).map(stream), false).unwrap();
+    let mut drones = new_env(task, (0..episodes).map(stream)).unwrap();
     let n = task.agents;
     let goals: Vec<u32> = (0..episodes).flat_map(|_| 0..n as u32).collect();
     drones.set_goals(&goals).unwrap();
@@ -251,7 +273,7 @@ fn the_reward_is_the_documented_sum() {
     set(&mut task, |d| (d.downwash, d.proximity, d.proximity_radius) = (Downwash::Off, 1.0, 0.4));
     let positions = [[0.0, 0.0, 1.5], [0.3, 0.0, 1.5]];
     let landmarks = [0.0, 0.1, 1.5, 2.0, 0.0, 1.5];
-    let mut drones = Drones::from_state(&task, positions.as_flattened(), &[0.0; 6], &landmarks).unwrap();
+    let mut drones = from_state(&task, positions.as_flattened(), &[0.0; 6], &landmarks).unwrap();
     drones.set_goals(&[0, 1]).unwrap();
     let (mut before, mut sum) = ([0.1, 1.7], 0.0);
     for _ in 0..5 {
@@ -276,7 +298,7 @@ fn the_reward_is_the_documented_sum() {
 #[test]
 fn two_landmarks_beside_one_drone_match_once() {
     let landmarks = [0.0, 0.1, 1.5, 0.0, -0.1, 1.5];
-    let drones = Drones::from_state(&task(2), &[0.0, 0.0, 1.5, 2.0, 0.0, 1.5], &[0.0; 6], &landmarks).unwrap();
+    let drones = from_state(&task(2), &[0.0, 0.0, 1.5, 2.0, 0.0, 1.5], &[0.0; 6], &landmarks).unwrap();
     let score = drones.scores()[0];
     assert_eq!((score[SUCCESS_RATE], score[MATCHED_SUCCESS_RATE], score[SPAWN_SUCCESS_RATE]), (1.0, 0.5, 1.0));
 }
@@ -284,8 +306,8 @@ fn two_landmarks_beside_one_drone_match_once() {
 #[test]
 fn mistakes_are_named() {
     let task = task(2);
-    let text = |result: Result<(), EnvError>| result.unwrap_err().to_string();
-    let mut drones = Drones::new(&task, std::iter::once(stream(1)), false).unwrap();
+    let text = |result: Result<(), FieldError>| result.unwrap_err().to_string();
+    let mut drones = new_env(&task, std::iter::once(stream(1))).unwrap();
     assert!(text(drones.step(&[1; 6], &mut [0.0; 2])).contains("set_goals"));
     assert!(text(drones.set_goals(&[0, 2])).contains("goals[1]: 2"));
     assert!(text(drones.set_goals(&[0])).contains("goals: 1 entries"));
@@ -294,22 +316,21 @@ fn mistakes_are_named() {
     assert!(text(drones.step(&[1; 5], &mut [0.0; 2])).contains("actions: 5"));
     assert!(text(drones.step(&[1; 6], &mut [0.0; 3])).contains("rewards: 3"));
     assert!(text(drones.write_agent_state(&mut [0.0; 11])).contains("agent_state"));
-    assert_eq!(drones.steps(), 0);
-    let refused =
-        |positions: &[f32]| Drones::from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
+    assert_eq!(drones.steps, 0);
+    let refused = |positions: &[f32]| from_state(&task, positions, &[0.0; 6], &[0.0; 6]).err().unwrap().to_string();
     assert!(refused(&[0.0; 5]).contains("positions"));
     assert!(refused(&[0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0]).contains("positions[2]"));
     for (hz, word) in [(100, "multiple"), (90, "chatters"), (30, "chatters"), (1950, "1920")] {
         let mut task = task.clone();
         set(&mut task, |d| d.physics_hz = hz);
-        let error = Drones::new(&task, std::iter::once(stream(1)), false).err().unwrap().to_string();
+        let error = new_env(&task, std::iter::once(stream(1))).err().unwrap().to_string();
         assert!(error.contains("task.drones.physics_hz") && error.contains(word), "{error}");
     }
     let mut crowded = task.clone();
     set(&mut crowded, |d| d.spacing = 2.5);
-    assert!(Drones::new(&crowded, std::iter::once(stream(1)), false).err().unwrap().to_string().contains("task.side"));
+    assert!(new_env(&crowded, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.side"));
     let spread = TaskConfig::simple_spread(2, Spawn::Uniform);
-    assert!(Drones::new(&spread, std::iter::once(stream(1)), false).err().unwrap().to_string().contains("task.name"));
+    assert!(new_env(&spread, std::iter::once(stream(1))).err().unwrap().to_string().contains("task.name"));
 }
 
 #[test]
@@ -327,10 +348,10 @@ proptest! {
     #[test]
     fn starts_keep_their_distance_and_stay_in_the_box(n in 1..9usize, k in 0..1000u32) {
         let task = task(n);
-        let drones = Drones::new(&task, std::iter::once(stream(k)), false).unwrap();
+        let drones = new_env(&task, std::iter::once(stream(k))).unwrap();
         let mut positions = vec![0.0; 3 * n];
         drones.write_positions(&mut positions).unwrap();
-        for points in [&positions[..], drones.landmarks()] {
+        for points in [&positions[..], drones.statics().get(LANDMARKS)] {
             let points: Vec<[f32; 3]> = points.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
             prop_assert!(apart(&points, 0.3 - 1e-5));
             prop_assert!(points.iter().all(|p| p[0].abs() <= 1.5 && p[1].abs() <= 1.5 && p[2] == 1.5));
@@ -340,9 +361,9 @@ proptest! {
     #[test]
     fn an_episode_does_not_see_its_neighbours(k in 0..1000u32, actions in random_actions(6)) {
         let task = task(2);
-        let mut together = Drones::new(&task, (k..k + 3).map(stream), false).unwrap();
+        let mut together = new_env(&task, (k..k + 3).map(stream)).unwrap();
         together.set_goals(&[0, 1, 1, 0, 0, 0]).unwrap();
-        let mut alone: Vec<_> = (k..k + 3).map(|k| Drones::new(&task, std::iter::once(stream(k)), false).unwrap()).collect();
+        let mut alone: Vec<_> = (k..k + 3).map(|k| new_env(&task, std::iter::once(stream(k))).unwrap()).collect();
         for (drones, goals) in alone.iter_mut().zip([[0, 1], [1, 0], [0, 0]]) {
             drones.set_goals(&goals).unwrap();
         }

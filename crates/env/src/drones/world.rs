@@ -35,14 +35,11 @@ pub enum Crash {
 #[derive(Debug, Clone, Copy)]
 pub struct Drone {
     pub(crate) motion: Motion,
-    /// Pose before the previous step.
     before: Pose,
     /// rpm of the previous step.
     pub rpm_before: [f64; 4],
     pub(crate) crash: Option<Crash>,
-    /// Does not move any more.
     pub(crate) fixed: bool,
-    /// Steps of rest so far.
     resting: u32,
 }
 
@@ -122,7 +119,6 @@ pub struct Laws {
     pub(crate) craft: Craft,
     pub(crate) effects: Effects,
     pub(crate) downwash: Downwash,
-    /// Seconds per physics step.
     pub(crate) dt: f64,
     /// Run rapier's pipeline in every step (for checks).
     pub always: bool,

@@ -5,38 +5,37 @@
 //! enough, ⌊N / 100⌋ + 1 uncovered landmarks are the proof, found by a scan that starts at the witness.
 
 use super::cells::Cells;
-use super::real::Real;
 
 /// The arrival steps of a batch.
 #[derive(Debug, Clone)]
-pub(crate) struct Arrivals<R, const W: usize> {
+pub(crate) struct Arrivals<const W: usize> {
     /// Landmarks that may stay uncovered.
     allowed: usize,
-    radius2: R,
+    radius2: f32,
     /// `[blocks][W]` step of arrival, 0 while it has not happened.
     steps: Vec<[u32; W]>,
     /// `[blocks]` worlds still waiting for it.
     waiting: Vec<u32>,
     /// `[blocks][W]` an uncovered landmark and where it is.
     witness: Vec<[u32; W]>,
-    wx: Vec<[R; W]>,
-    wy: Vec<[R; W]>,
+    wx: Vec<[f32; W]>,
+    wy: Vec<[f32; W]>,
 }
 
 /// The worlds of one block as the arrival test sees them.
-pub(crate) struct View<'a, R, const W: usize> {
+pub(crate) struct View<'a, const W: usize> {
     /// `[N][W]`
-    pub(crate) x: &'a [[R; W]],
-    pub(crate) y: &'a [[R; W]],
+    pub(crate) x: &'a [[f32; W]],
+    pub(crate) y: &'a [[f32; W]],
     /// `[worlds of the block, N, 2]`
-    pub(crate) landmarks: &'a [R],
+    pub(crate) landmarks: &'a [f32],
     /// The block's only world, sorted.
-    pub(crate) cells: Option<&'a Cells<R>>,
+    pub(crate) cells: Option<&'a Cells<f32>>,
 }
 
-impl<R: Real, const W: usize> Arrivals<R, W> {
+impl<const W: usize> Arrivals<W> {
     /// `landmarks` is `[B, N, 2]`.
-    pub(crate) fn new(worlds: usize, agents: usize, radius2: R, landmarks: &[R]) -> Self {
+    pub(crate) fn new(worlds: usize, agents: usize, radius2: f32, landmarks: &[f32]) -> Self {
         let blocks = worlds.div_ceil(W);
         let mut new = Self {
             allowed: agents / 100,
@@ -44,8 +43,8 @@ impl<R: Real, const W: usize> Arrivals<R, W> {
             steps: vec![[0; W]; blocks],
             waiting: vec![0; blocks],
             witness: vec![[0; W]; blocks],
-            wx: vec![[R::ZERO; W]; blocks],
-            wy: vec![[R::ZERO; W]; blocks],
+            wx: vec![[0.0; W]; blocks],
+            wy: vec![[0.0; W]; blocks],
         };
         for (world, points) in landmarks.chunks_exact(2 * agents).enumerate() {
             let (block, w) = (world / W, world % W);
@@ -61,12 +60,12 @@ impl<R: Real, const W: usize> Arrivals<R, W> {
     }
 
     /// Looks at a block after step number `step` (from 1).
-    pub(crate) fn observe(&mut self, block: usize, step: u32, view: &View<'_, R, W>) {
+    pub(crate) fn observe(&mut self, block: usize, step: u32, view: &View<'_, W>) {
         if self.waiting[block] == 0 {
             return;
         }
         // Squared distance of the witness to the nearest agent; one witness is no proof if others may be uncovered.
-        let mut nearest = [if self.allowed == 0 { R::from_f64(f64::MAX) } else { R::ZERO }; W];
+        let mut nearest = [if self.allowed == 0 { f32::INFINITY } else { 0.0 }; W];
         if self.allowed == 0 {
             let (wx, wy) = (self.wx[block], self.wy[block]);
             for (x, y) in view.x.iter().zip(view.y) {
@@ -88,7 +87,7 @@ impl<R: Real, const W: usize> Arrivals<R, W> {
     }
 
     /// Finds more than `allowed` uncovered landmarks and remembers the first; false if there are fewer.
-    fn find_witness(&mut self, block: usize, w: usize, view: &View<'_, R, W>) -> bool {
+    fn find_witness(&mut self, block: usize, w: usize, view: &View<'_, W>) -> bool {
         let n = view.x.len();
         let landmarks = &view.landmarks[2 * n * w..2 * n * (w + 1)];
         let start = self.witness[block][w] as usize;

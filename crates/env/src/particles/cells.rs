@@ -49,7 +49,7 @@ impl<R: Real> Cells<R> {
     /// Column (or row) of a coordinate.
     #[inline(always)]
     fn column(&self, coordinate: R) -> usize {
-        let place = ((coordinate - self.low) * self.inverse_side).to_f64();
+        let place: f64 = ((coordinate - self.low) * self.inverse_side).into();
         (place as i32).clamp(0, self.columns as i32 - 1) as usize
     }
 
@@ -134,16 +134,13 @@ impl<R: Real> Cells<R> {
     /// Whether any body is within √radius2 (≤ the cells' reach) of a point.
     pub(crate) fn any_within(&self, x: R, y: R, radius2: R) -> bool {
         let (row, column) = (self.column(y), self.column(x));
-        for row in row.saturating_sub(1)..(row + 2).min(self.columns) {
+        (row.saturating_sub(1)..(row + 2).min(self.columns)).any(|row| {
             let (from, to) = self.run(row, column);
-            for place in from..to {
+            (from..to).any(|place| {
                 let (dx, dy) = (self.x[place] - x, self.y[place] - y);
-                if dx.mul_add(dx, dy * dy) <= radius2 {
-                    return true;
-                }
-            }
-        }
-        false
+                dx.mul_add(dx, dy * dy) <= radius2
+            })
+        })
     }
 }
 

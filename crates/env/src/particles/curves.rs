@@ -4,31 +4,21 @@ use magex_core::rng::Stream;
 use std::f64::consts::PI;
 
 /// Number of layouts in a set.
-pub const LAYOUTS: u8 = 4;
+pub(crate) const LAYOUTS: u8 = 4;
 
-/// A line that points are laid out on.
+/// A straight line with its two ends, or a circle around the origin, that points are laid out on.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Curve {
-    /// A straight line with its two ends.
-    Segment {
-        /// First end.
-        from: [f64; 2],
-        /// Last end.
-        to: [f64; 2],
-    },
-    /// A circle around the origin.
-    Circle {
-        /// Its radius.
-        radius: f64,
-    },
+pub(crate) enum Curve {
+    Segment { from: [f64; 2], to: [f64; 2] },
+    Circle { radius: f64 },
 }
 
 /// Curves and the number of points on each.
-pub type Points = Vec<(Curve, usize)>;
+pub(crate) type Points = Vec<(Curve, usize)>;
 
 impl Curve {
     /// The same curve, `factor` times as large.
-    pub fn scaled(self, factor: f64) -> Self {
+    pub(crate) fn scaled(self, factor: f64) -> Self {
         match self {
             Self::Segment { from, to } => Self::Segment { from: from.map(|c| c * factor), to: to.map(|c| c * factor) },
             Self::Circle { radius } => Self::Circle { radius: radius * factor },
@@ -36,7 +26,7 @@ impl Curve {
     }
 
     /// Arc length.
-    pub fn length(self) -> f64 {
+    pub(crate) fn length(self) -> f64 {
         match self {
             Self::Segment { from, to } => libm::hypot(to[0] - from[0], to[1] - from[1]),
             Self::Circle { radius } => 2.0 * PI * radius,
@@ -44,7 +34,7 @@ impl Curve {
     }
 
     /// The point at an arc length from the first end (from angle −π, counter-clockwise).
-    pub fn at(self, arc: f64) -> [f64; 2] {
+    pub(crate) fn at(self, arc: f64) -> [f64; 2] {
         match self {
             Self::Segment { from, to } => {
                 let t = arc / self.length();
@@ -58,7 +48,7 @@ impl Curve {
     }
 
     /// n equally spaced points in the authors' order: both ends of a segment, a circle ending at angle π.
-    pub fn even(self, n: usize) -> impl Iterator<Item = [f64; 2]> {
+    pub(crate) fn even(self, n: usize) -> impl Iterator<Item = [f64; 2]> {
         (0..n).map(move |k| self.at(self.even_arc(k, n)))
     }
 
@@ -74,7 +64,7 @@ impl Curve {
 
     /// The k-th of n equally spaced points, moved along the curve by up to `share` of the way to its neighbours, and by no
     /// more than leaves moved neighbours `spacing` apart; the ends of a segment move inwards.
-    pub fn jittered(self, (k, n): (usize, usize), share: f64, spacing: f64, stream: &mut Stream) -> [f64; 2] {
+    pub(crate) fn jittered(self, (k, n): (usize, usize), share: f64, spacing: f64, stream: &mut Stream) -> [f64; 2] {
         let (length, even) = (self.length(), self.even_arc(k, n));
         let (gaps, spacing) = match self {
             Self::Segment { .. } => (n.saturating_sub(1).max(1), spacing),
@@ -97,7 +87,7 @@ impl Curve {
     /// uniform in each, and the spacings are put back in. Wherever there is room, this is one uniform point per equal
     /// cell of the curve; where the points fill the curve (50 landmarks on a line of length 10), they can barely move;
     /// where they do not fit, they are equally spaced.
-    pub fn stratified(self, n: usize, spacing: f64, stream: &mut Stream) -> Vec<[f64; 2]> {
+    pub(crate) fn stratified(self, n: usize, spacing: f64, stream: &mut Stream) -> Vec<[f64; 2]> {
         let length = self.length();
         let (gaps, spacing, start) = match self {
             Self::Segment { .. } => (n.saturating_sub(1), spacing, 0.0),

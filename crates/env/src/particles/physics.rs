@@ -41,11 +41,6 @@ impl<R: Real> Physics<R> {
     pub(crate) fn standard() -> Self {
         Self::new(0.1, 0.25, 100.0, 1e-3, 5.0)
     }
-
-    /// Distance from which a contact at `touch` is exactly zero here (see [`Real::NEGLIGIBLE`]).
-    pub fn reach(&self, touch: R) -> R {
-        R::NEGLIGIBLE.mul_add(self.margin, touch)
-    }
 }
 
 /// What two bodies are to each other.
@@ -67,19 +62,26 @@ impl<R: Real> Pair<R> {
     /// Two movable bodies of equal mass.
     pub fn equal(physics: &Physics<R>, touch: f64) -> Self {
         let touch = R::from_f64(touch);
-        let reach = physics.reach(touch);
+        // From there on a contact is exactly zero here.
+        let reach = R::NEGLIGIBLE.mul_add(physics.margin, touch);
         Self { touch, touch2: touch * touch, reach2: reach * reach, on_first: R::ONE, on_second: R::ONE }
     }
 }
 
 /// The bodies of a world.
-pub trait Bodies<R> {
+pub trait Bodies<R: Real> {
     /// The pair (i, j), i < j.
     fn pair(&self, i: usize, j: usize) -> Pair<R>;
     /// 1 / mass.
-    fn inverse_mass(&self, i: usize) -> R;
+    #[inline(always)]
+    fn inverse_mass(&self, _i: usize) -> R {
+        R::ONE
+    }
     /// Whether the body moves at all.
-    fn movable(&self, i: usize) -> bool;
+    #[inline(always)]
+    fn movable(&self, _i: usize) -> bool {
+        true
+    }
     /// The largest reach² of any pair.
     fn reach2(&self) -> R;
 }
@@ -92,14 +94,6 @@ impl<R: Real> Bodies<R> for Alike<R> {
     #[inline(always)]
     fn pair(&self, _: usize, _: usize) -> Pair<R> {
         self.0
-    }
-    #[inline(always)]
-    fn inverse_mass(&self, _: usize) -> R {
-        R::ONE
-    }
-    #[inline(always)]
-    fn movable(&self, _: usize) -> bool {
-        true
     }
     #[inline(always)]
     fn reach2(&self) -> R {
@@ -129,14 +123,6 @@ impl<R: Real> Bodies<R> for AgentsAndBalls<R> {
     #[inline(always)]
     fn pair(&self, i: usize, j: usize) -> Pair<R> {
         self.pairs[usize::from(i >= self.agents) + usize::from(j >= self.agents)]
-    }
-    #[inline(always)]
-    fn inverse_mass(&self, _: usize) -> R {
-        R::ONE
-    }
-    #[inline(always)]
-    fn movable(&self, _: usize) -> bool {
-        true
     }
     #[inline(always)]
     fn reach2(&self) -> R {

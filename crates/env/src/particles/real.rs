@@ -9,18 +9,11 @@
 //! result depends on the machine, on a mathematics library or on how the compiler vectorised.
 
 use std::fmt::Debug;
-use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
-
-mod sealed {
-    pub trait Sealed {}
-    impl Sealed for f32 {}
-    impl Sealed for f64 {}
-}
+use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub};
 
 /// f32 or f64.
 pub trait Real:
-    sealed::Sealed
-    + Copy
+    Copy
     + Default
     + Debug
     + PartialOrd
@@ -30,7 +23,8 @@ pub trait Real:
     + Div<Output = Self>
     + Neg<Output = Self>
     + AddAssign
-    + SubAssign
+    + From<i8>
+    + Into<f64>
     + Send
     + Sync
     + 'static
@@ -49,10 +43,6 @@ pub trait Real:
     const NEGLIGIBLE: Self;
     /// Nearest number.
     fn from_f64(value: f64) -> Self;
-    /// Exact.
-    fn from_i8(value: i8) -> Self;
-    /// Exact.
-    fn to_f64(self) -> f64;
     /// self · a + b, rounded once.
     fn mul_add(self, a: Self, b: Self) -> Self;
     /// Square root, correctly rounded.
@@ -123,91 +113,57 @@ const EXP_F32: [f32; 8] = narrow(inverse_factorials());
 const ATANH_F64: [f64; 16] = inverse_odds();
 const ATANH_F32: [f32; 8] = narrow(inverse_odds());
 
-impl Real for f32 {
-    const ZERO: Self = 0.0;
-    const ONE: Self = 1.0;
-    const TWO: Self = 2.0;
-    const NEGLIGIBLE: Self = 20.0;
+/// $round is 1.5 · 2^$mantissa plus the bias of the exponent: adding it rounds to a whole number n and leaves n + bias in the
+/// low bits, so that 2^n is a shift away. $ln2 is ln 2 in two parts, the first short enough for n · part to be exact.
+macro_rules! real {
+    ($real:ident, $negligible:literal, $most:literal, $round:expr, $mantissa:literal, $ln2:expr, $exp:ident, $atanh:ident) => {
+        impl Real for $real {
+            const ZERO: Self = 0.0;
+            const ONE: Self = 1.0;
+            const TWO: Self = 2.0;
+            const NEGLIGIBLE: Self = $negligible;
 
-    #[inline(always)]
-    fn from_f64(value: f64) -> Self {
-        value as f32
-    }
-    #[inline(always)]
-    fn from_i8(value: i8) -> Self {
-        f32::from(value)
-    }
-    #[inline(always)]
-    fn to_f64(self) -> f64 {
-        f64::from(self)
-    }
-    #[inline(always)]
-    fn mul_add(self, a: Self, b: Self) -> Self {
-        f32::mul_add(self, a, b)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        f32::sqrt(self)
-    }
-    #[inline(always)]
-    fn exp_neg(self) -> Self {
-        // Adding 1.5 · 2^23 rounds to a whole number n and leaves n + 127 in the low bits: 2^n is a shift away.
-        const ROUND: f32 = 12_582_912.0 + 127.0;
-        let x = if self < 87.0 { -self } else { -87.0 };
-        let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
-        let n = shifted - ROUND;
-        // ln 2 in two parts, the first short enough for n · part to be exact.
-        let r = n.mul_add(-0.693_145_75, x);
-        let r = n.mul_add(-1.428_606_8e-6, r);
-        horner(r, &EXP_F32) * f32::from_bits(shifted.to_bits() << 23)
-    }
-    #[inline(always)]
-    fn atanh_series(s: Self) -> Self {
-        horner(s, &ATANH_F32)
-    }
+            #[inline(always)]
+            fn from_f64(value: f64) -> Self {
+                value as Self
+            }
+            #[inline(always)]
+            fn mul_add(self, a: Self, b: Self) -> Self {
+                $real::mul_add(self, a, b)
+            }
+            #[inline(always)]
+            fn sqrt(self) -> Self {
+                $real::sqrt(self)
+            }
+            #[inline(always)]
+            fn exp_neg(self) -> Self {
+                const ROUND: $real = $round;
+                const LN_2: [$real; 2] = $ln2;
+                let x = if self < $most { -self } else { -$most };
+                let shifted = x.mul_add(std::$real::consts::LOG2_E, ROUND);
+                let n = shifted - ROUND;
+                let r = n.mul_add(-LN_2[1], n.mul_add(-LN_2[0], x));
+                horner(r, &$exp) * $real::from_bits(shifted.to_bits() << $mantissa)
+            }
+            #[inline(always)]
+            fn atanh_series(s: Self) -> Self {
+                horner(s, &$atanh)
+            }
+        }
+    };
 }
 
-impl Real for f64 {
-    const ZERO: Self = 0.0;
-    const ONE: Self = 1.0;
-    const TWO: Self = 2.0;
-    const NEGLIGIBLE: Self = 36.0;
-
-    #[inline(always)]
-    fn from_f64(value: f64) -> Self {
-        value
-    }
-    #[inline(always)]
-    fn from_i8(value: i8) -> Self {
-        f64::from(value)
-    }
-    #[inline(always)]
-    fn to_f64(self) -> f64 {
-        self
-    }
-    #[inline(always)]
-    fn mul_add(self, a: Self, b: Self) -> Self {
-        f64::mul_add(self, a, b)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        f64::sqrt(self)
-    }
-    #[inline(always)]
-    fn exp_neg(self) -> Self {
-        const ROUND: f64 = 6_755_399_441_055_744.0 + 1023.0;
-        let x = if self < 708.0 { -self } else { -708.0 };
-        let shifted = x.mul_add(std::f64::consts::LOG2_E, ROUND);
-        let n = shifted - ROUND;
-        let r = n.mul_add(-6.931_471_803_691_238e-1, x);
-        let r = n.mul_add(-1.908_214_929_270_587_7e-10, r);
-        horner(r, &EXP_F64) * f64::from_bits(shifted.to_bits() << 52)
-    }
-    #[inline(always)]
-    fn atanh_series(s: Self) -> Self {
-        horner(s, &ATANH_F64)
-    }
-}
+real!(f32, 20.0, 87.0, 12_582_912.0 + 127.0, 23, [0.693_145_75, 1.428_606_8e-6], EXP_F32, ATANH_F32);
+real!(
+    f64,
+    36.0,
+    708.0,
+    6_755_399_441_055_744.0 + 1023.0,
+    52,
+    [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10],
+    EXP_F64,
+    ATANH_F64
+);
 
 #[cfg(test)]
 mod tests {

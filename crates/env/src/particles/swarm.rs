@@ -9,7 +9,7 @@ use std::ops::Range;
 /// The worlds, E bodies each; the first N of them act. Array element `[block · E + i][w]` belongs to body i of world
 /// block · W + w; the lanes of the last block that have no world hold bodies far apart, at rest.
 #[derive(Debug, Clone)]
-pub(crate) struct Swarm<R, const W: usize, B> {
+pub struct Swarm<R, const W: usize, B> {
     worlds: usize,
     agents: usize,
     bodies: usize,
@@ -27,18 +27,20 @@ pub(crate) struct Swarm<R, const W: usize, B> {
     /// Large worlds (W = 1) compare neighbours only.
     pub(crate) cells: Option<Cells<R>>,
     pairs: Pairs,
+    /// `[B, N, 2]`
+    pub(crate) landmarks: Vec<R>,
     /// `[E]` one block's actions, lanes innermost; those of bodies that do not act stay 0.
     actions: Vec<[u8; W]>,
 }
 
 impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
-    /// Worlds with the given positions and velocities, each `[B, E, 2]`, E = `bodies` of which `agents` act. A
-    /// `cells_over` the side of the map, if given and W = 1, finds neighbours by cells.
-    pub(crate) fn new(
+    /// Worlds with the given positions and velocities `[B, E, 2]`, E = `bodies` of which `agents` act, and landmarks
+    /// `[B, N, 2]`. A `cells_over` the side of the map, if given and W = 1, finds neighbours by cells.
+    pub fn new(
+        physics: Physics<R>,
         kinds: B,
         (agents, bodies): (usize, usize),
-        positions: &[R],
-        velocities: &[R],
+        [positions, velocities, landmarks]: [&[R]; 3],
         cells_over: Option<f64>,
     ) -> Self {
         let worlds = positions.len() / (2 * bodies);
@@ -49,7 +51,7 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
             worlds,
             agents,
             bodies,
-            physics: Physics::standard(),
+            physics,
             x: (0..blocks * bodies).map(|k| [R::from_f64((k % bodies) as f64); W]).collect(),
             y: zero.clone(),
             vx: zero.clone(),
@@ -57,9 +59,10 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
             fx: zero.clone(),
             fy: zero.clone(),
             hits: zero,
-            cells: cells.map(|side| Cells::new(bodies, side, kinds.reach2().to_f64().sqrt())),
+            cells: cells.map(|side| Cells::new(bodies, side, Into::<f64>::into(kinds.reach2()).sqrt())),
             kinds,
             pairs: Vec::new(),
+            landmarks: landmarks.to_vec(),
             actions: vec![[0; W]; bodies],
         };
         for world in 0..worlds {
@@ -86,12 +89,28 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
         block * self.bodies..(block + 1) * self.bodies
     }
 
+    /// E.
+    pub fn bodies(&self) -> usize {
+        self.bodies
+    }
+
     pub(crate) fn worlds(&self) -> usize {
         self.worlds
     }
 
+    pub(crate) fn agents(&self) -> usize {
+        self.agents
+    }
+
+    /// A landmark of a world.
+    #[inline(always)]
+    pub(crate) fn landmark(&self, world: usize, landmark: usize) -> [R; 2] {
+        let at = 2 * (world * self.agents + landmark);
+        [self.landmarks[at], self.landmarks[at + 1]]
+    }
+
     /// One step of a block: moves its bodies, then looks for contacts. `actions` is `[worlds of the block, N]`.
-    pub(crate) fn step(&mut self, block: usize, actions: &[u8]) {
+    pub fn step(&mut self, block: usize, actions: &[u8]) {
         for (w, world) in actions.chunks_exact(self.agents).enumerate() {
             for (lanes, &action) in self.actions.iter_mut().zip(world) {
                 lanes[w] = action;
@@ -116,8 +135,8 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
             let (mut ux, mut uy) = ([R::ZERO; W], [R::ZERO; W]);
             let a = &actions[i];
             for w in 0..W {
-                ux[w] = u * R::from_i8(i8::from(a[w] == 1) - i8::from(a[w] == 2));
-                uy[w] = u * R::from_i8(i8::from(a[w] == 3) - i8::from(a[w] == 4));
+                ux[w] = u * R::from(i8::from(a[w] == 1) - i8::from(a[w] == 2));
+                uy[w] = u * R::from(i8::from(a[w] == 3) - i8::from(a[w] == 4));
             }
             (ux, uy)
         });
@@ -141,12 +160,12 @@ impl<R: Real, const W: usize, B: Bodies<R>> Swarm<R, W, B> {
     }
 
     /// Writes `[B, E, 2]`.
-    pub(crate) fn write_positions(&self, out: &mut [R]) {
+    pub fn write_positions(&self, out: &mut [R]) {
         self.interleave(&self.x, &self.y, out);
     }
 
     /// Writes `[B, E, 2]`.
-    pub(crate) fn write_velocities(&self, out: &mut [R]) {
+    pub fn write_velocities(&self, out: &mut [R]) {
         self.interleave(&self.vx, &self.vy, out);
     }
 

@@ -1,63 +1,35 @@
-//! What Push Ball pays for.
+//! The way of an agent by its ball to a landmark; [`magex_core::task::PushBallConfig`] has the law of the reward.
 
-use super::constants::{PUSH_DISTANCE, REACHED};
+use super::constants::REACHED;
 use crate::particles::real::Real;
 use magex_core::task::PushBallConfig;
 
-/// The coefficients of the reward in the physics' scalar; see [`PushBallConfig`] for the law.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Law<R> {
-    pub(crate) progress: R,
-    arc: R,
-    pub(crate) bonus: R,
-    pub(crate) distance: R,
-    /// The distance at which an agent touches a ball.
-    push: R,
-    /// REACHED².
-    pub(crate) reached2: R,
-    /// 1 / REACHED.
-    per_reached: R,
-}
-
 /// The two legs of an agent's way at one moment.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Legs<R> {
+pub(super) struct Legs {
     /// Φ, minus the way left.
-    pub(crate) potential: R,
-    /// d_ab + d_bl.
-    pub(crate) distance: R,
-    /// d_bl².
-    pub(crate) last2: R,
+    pub(super) potential: f32,
+    pub(super) distance: f32,
+    pub(super) last2: f32,
 }
 
-impl<R: Real> Law<R> {
-    pub(crate) fn new(config: &PushBallConfig) -> Self {
-        let reached = R::from_f64(REACHED);
-        Self {
-            progress: R::from_f64(f64::from(config.progress)),
-            arc: R::from_f64(f64::from(config.turn_length)),
-            bonus: R::from_f64(f64::from(config.bonus)),
-            distance: R::from_f64(f64::from(config.distance)),
-            push: R::from_f64(PUSH_DISTANCE),
-            reached2: reached * reached,
-            per_reached: R::from_f64(1.0 / REACHED),
-        }
-    }
-
-    /// The legs, given as vectors agent → ball and ball → landmark.
+impl Legs {
+    /// From the vectors agent → ball and ball → landmark and the turn length.
     #[inline(always)]
-    pub(crate) fn legs(&self, (ax, ay): (R, R), (bx, by): (R, R)) -> Legs<R> {
+    pub(super) fn new((ax, ay): (f32, f32), (bx, by): (f32, f32), turn_length: f32) -> Self {
+        const PUSH: f32 = PushBallConfig::PUSH_DISTANCE as f32;
+        const PER_REACHED: f32 = (1.0 / REACHED) as f32;
         let d_ab = ax.mul_add(ax, ay * ay).sqrt();
         let last2 = bx.mul_add(bx, by * by);
         let d_bl = last2.sqrt();
-        let gap = d_ab - self.push;
-        let gap = if gap > R::ZERO { gap } else { R::ZERO };
-        let near = d_bl * self.per_reached;
-        let near = if near < R::ONE { near } else { R::ONE };
+        let gap = d_ab - PUSH;
+        let gap = if gap > 0.0 { gap } else { 0.0 };
+        let near = d_bl * PER_REACHED;
+        let near = if near < 1.0 { near } else { 1.0 };
         let (dot, cross) = (ax.mul_add(bx, ay * by), ax.mul_add(by, -(ay * bx)));
-        let turn = self.arc * near * angle(dot, cross, d_ab * d_bl);
+        let turn = turn_length * near * angle(dot, cross, d_ab * d_bl);
         let path = gap + turn;
-        Legs { potential: -R::TWO.mul_add(d_bl, path), distance: d_ab + d_bl, last2 }
+        Self { potential: -(2.0f32.mul_add(d_bl, path)), distance: d_ab + d_bl, last2 }
     }
 }
 

@@ -9,24 +9,21 @@ use magex_core::task::TaskConfig;
 
 /// Where the agents, the landmarks and the balls of one layout are.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Layout {
+pub(super) struct Layout {
     /// The paper's orange points, for agents and landmarks; 2N in all.
-    pub slots: Points,
+    pub(super) slots: Points,
     /// The paper's pink points; N in all.
-    pub balls: Points,
+    pub(super) balls: Points,
 }
 
 /// The sizes that tell the two sets apart.
 struct Set {
-    /// Half the length of every line.
     half: f64,
     /// Height of the slots' lines in layouts 0, 1 and 3.
     heights: [f64; 3],
-    /// Radii of the slots' circles.
     circles: [f64; 2],
     /// Share of the slots that is on the inner circle.
     inner: f64,
-    /// Radius of the balls' circle.
     circle: f64,
 }
 
@@ -41,7 +38,7 @@ fn set(n: usize) -> &'static Set {
 }
 
 /// Layout `index` (modulo 4) for N agents, balls and landmarks, in raw units.
-pub fn layout(index: u8, n: usize) -> Layout {
+pub(super) fn layout(index: u8, n: usize) -> Layout {
     let set = set(n);
     let horizontal = |y: f64| Curve::Segment { from: [-set.half, y], to: [set.half, y] };
     let lines = |height: f64| vec![(horizontal(height), n), (horizontal(-height), n)];
@@ -62,7 +59,7 @@ pub fn layout(index: u8, n: usize) -> Layout {
 
 /// World units per raw unit: the task's `layout_scale` for the authors' sizes (20 and 50), else whatever makes the lines
 /// as long as the map, and long enough for the balls to stand apart.
-pub fn scale(task: &TaskConfig) -> f64 {
+pub(super) fn scale(task: &TaskConfig) -> f64 {
     match task.agents {
         20 | 50 => 1.0 / f64::from(task.layout_scale),
         n => f64::from(task.side).max(SPACING * n as f64) / (2.0 * set(n).half),
@@ -87,7 +84,8 @@ mod tests {
                 let layout = layout(index, n);
                 for (kind, points) in [("map", &layout.slots), ("ball", &layout.balls)] {
                     let ours = sorted(points.iter().flat_map(|&(curve, n)| curve.even(n)).collect());
-                    let theirs = sorted(crate::layouts::tests::file(&format!("{n}agent_push_ball_{kind}_{index}.txt")));
+                    let theirs =
+                        sorted(crate::spread::layouts::tests::file(&format!("{n}agent_push_ball_{kind}_{index}.txt")));
                     assert_eq!(ours.len(), theirs.len());
                     for (a, b) in ours.iter().zip(&theirs) {
                         let error = (a[0] - b[0]).abs().max((a[1] - b[1]).abs());

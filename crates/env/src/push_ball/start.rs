@@ -1,14 +1,16 @@
 //! Where the agents, balls and landmarks of an episode start.
 
-use super::constants::{PUSH_DISTANCE, SPACING};
+use super::constants::SPACING;
 use super::layouts::{layout, scale};
 use crate::particles::constants::CONTACT_DISTANCE;
 use crate::particles::curves::{Curve, LAYOUTS, Points};
 use crate::particles::placement::{lattice, near, scatter};
 use magex_core::error::FieldError;
 use magex_core::rng::Stream;
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{PushBallConfig, Spawn, TaskConfig};
 
+/// Agents start at least this far from balls.
+const PUSH_DISTANCE: f64 = PushBallConfig::PUSH_DISTANCE;
 /// Part of the way to a neighbour by which points on the lines are moved.
 const JITTER: f64 = 0.3;
 /// Tries after which a slot stays where it is, or an agent out of line.
@@ -20,7 +22,7 @@ const ASIDE: f64 = 0.6;
 
 /// The start of an episode. Balls start 0.3 from each other, agents 0.2 from each other and 0.25 from balls.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Start {
+pub(super) struct Start {
     /// `[N, 2]`
     pub agents: Vec<f32>,
     /// `[N, 2]`
@@ -32,7 +34,7 @@ pub struct Start {
 /// Draws the start of an episode from its own stream. What `training` may add is drawn last, so that the same stream
 /// gives an evaluation episode the same start whatever `task.push_ball.start_in_line_fraction` is. An error if the task is
 /// another one.
-pub fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Result<Start, FieldError> {
+pub(super) fn spawn(task: &TaskConfig, training: bool, stream: &mut Stream) -> Result<Start, FieldError> {
     let in_line = task.push_ball()?.start_in_line_fraction;
     let mut start = match task.spawn {
         Spawn::Uniform => uniform(task.agents, task.side, stream),

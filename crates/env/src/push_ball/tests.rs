@@ -1,5 +1,6 @@
 use super::*;
-use crate::env::Env as _;
+use crate::env::Env;
+use crate::tasks::{env_from_state, new_env};
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD, SPAWN_SUCCESS_RATE,
     SUCCESS_RATE,
@@ -21,11 +22,11 @@ fn own(episodes: u32, agents: usize) -> Vec<u32> {
 }
 
 /// Worlds of one agent and one ball each, at the given places, and their landmark.
-fn lone(worlds: &[[f32; 6]]) -> (TaskConfig, PushBall) {
+fn lone(worlds: &[[f32; 6]]) -> (TaskConfig, Env) {
     let task = task(1, Spawn::Uniform);
     let positions: Vec<f32> = worlds.iter().flat_map(|world| world[..4].to_vec()).collect();
     let landmarks: Vec<f32> = worlds.iter().flat_map(|world| world[4..].to_vec()).collect();
-    let mut env = PushBall::from_state(&task, &positions, &vec![0.0; positions.len()], &landmarks).unwrap();
+    let mut env = env_from_state(&task, &positions, &vec![0.0; positions.len()], &landmarks).unwrap();
     env.set_goals(&own(worlds.len() as u32, 1)).unwrap();
     (task, env)
 }
@@ -64,7 +65,7 @@ fn the_reward_is_the_documented_one_of_the_step() {
             let expected = 2.0 * (potential(&now) - potential(before)) + bonus;
             assert!((f64::from(rewards[b]) - expected).abs() < 2e-5, "{action} {b}: {} {expected}", rewards[b]);
         }
-        assert!((env.scores()[0][REWARD] - rewards[0]).abs() < 1e-6 && env.steps() == 1 && task.horizon > 1);
+        assert!((env.scores()[0][REWARD] - rewards[0]).abs() < 1e-6 && env.steps == 1 && task.horizon > 1);
     }
 }
 
@@ -75,7 +76,7 @@ fn the_authors_reward_is_a_choice_of_coefficients() {
     task.settings = TaskSettings::PushBall(authors);
     let positions = [0.0, 0.0, 3.0, 3.0, 0.0, 1.0, 3.0, 1.0];
     let landmarks = [3.0, 1.2, -1.0, 1.0];
-    let mut env = PushBall::from_state(&task, &positions, &[0.0; 8], &landmarks).unwrap();
+    let mut env = env_from_state(&task, &positions, &[0.0; 8], &landmarks).unwrap();
     env.set_goals(&[0, 1, 1, 0]).unwrap();
     let mut rewards = [0.0; 2];
     env.step(&[0, 0], &mut rewards).unwrap();
@@ -106,7 +107,7 @@ fn a_ball_is_pushed_by_contact_only_and_momentum_is_conserved() {
     let task = task(1, Spawn::Uniform);
     let positions = [0.0, 0.0, 0.5, 0.03];
     let velocities = [2.0, 0.1, 0.0, 0.0];
-    let mut env = PushBall::from_state(&task, &positions, &velocities, &[5.0, 5.0]).unwrap();
+    let mut env = env_from_state(&task, &positions, &velocities, &[5.0, 5.0]).unwrap();
     env.set_goals(&[0, 0]).unwrap();
     let mut whole = [2.0, 0.1];
     for step in 0..30 {
@@ -139,7 +140,7 @@ fn success_takes_any_ball_and_matched_success_the_own_one() {
     // Ball 0 covers landmark 1, ball 1 landmark 0, ball 2 only just landmark 2; agents 0 and 1 overlap.
     let positions = [3.0, 3.0, 3.1, 3.0, -3.0, -3.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0];
     let landmarks = [0.0, 0.2, 1.0, 0.2, -1.0, -0.3];
-    let start = || PushBall::from_state(&task, &positions, &[0.0; 12], &landmarks).unwrap();
+    let start = || env_from_state(&task, &positions, &[0.0; 12], &landmarks).unwrap();
     let play = |goals: &[u32]| {
         let mut env = start();
         env.set_goals(goals).unwrap();
@@ -157,7 +158,7 @@ fn success_takes_any_ball_and_matched_success_the_own_one() {
     }
     assert_eq!(start().scores()[0][MATCHED_SUCCESS_RATE], 0.0);
     let apart = [0.0, 0.2, 1.0, 0.2, -1.0, -0.31];
-    let env = PushBall::from_state(&task, &positions, &[0.0; 12], &apart).unwrap();
+    let env = env_from_state(&task, &positions, &[0.0; 12], &apart).unwrap();
     assert_eq!((env.scores()[0][SUCCESS_RATE], env.scores()[0][ARRIVAL_STEP]), (2.0 / 3.0, (task.horizon + 1) as f32));
 }
 
@@ -168,7 +169,7 @@ fn collisions_are_those_of_agents_among_themselves() {
     task.side = 8.0;
     let positions = [0.0, 0.0, 0.21, 0.0, 3.0, 3.0, 3.0, 3.2, 3.0, 3.45, -3.0, 0.0];
     let velocities = [1.0, 0.0, -1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0];
-    let mut env = PushBall::from_state(&task, &positions, &velocities, &[0.0; 6]).unwrap();
+    let mut env = env_from_state(&task, &positions, &velocities, &[0.0; 6]).unwrap();
     env.set_goals(&own(1, 3)).unwrap();
     env.step(&[0; 3], &mut [0.0; 3]).unwrap();
     let p = env.positions();
@@ -177,11 +178,11 @@ fn collisions_are_those_of_agents_among_themselves() {
 }
 
 /// Everything an episode produces with random actions.
-fn run(env: &mut PushBall, goals: &[u32], seed: u32, steps: u32, table: impl Fn(u32, usize) -> u8) -> Vec<Vec<u32>> {
+fn run(env: &mut Env, goals: &[u32], seed: u32, steps: u32, table: impl Fn(u32, usize) -> u8) -> Vec<Vec<u32>> {
     let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
     env.set_goals(goals).unwrap();
     let mut rewards = vec![0.0; goals.len() / 2];
-    let mut log = vec![bits(env.landmarks())];
+    let mut log = vec![bits(env.statics().get(LANDMARKS))];
     for step in 0..steps {
         let actions: Vec<u8> = (0..rewards.len()).map(|k| table(seed + step, k)).collect();
         env.step(&actions, &mut rewards).unwrap();
@@ -207,10 +208,10 @@ fn an_episode_is_the_same_alone_and_in_any_batch() {
         let goals: Vec<u32> =
             (0..agents as u32).flat_map(|i| [(i + 1) % agents as u32, agents as u32 - 1 - i]).collect();
         let all: Vec<u32> = (0..episodes).flat_map(|_| goals.clone()).collect();
-        let mut together = PushBall::new(&task, streams(episodes), false).unwrap();
+        let mut together = new_env(&task, streams(episodes), false).unwrap();
         let together = run(&mut together, &all, 0, 40, |step, k| action(step, (k / agents) as u32, k % agents));
         for (b, stream) in streams(episodes).enumerate() {
-            let mut alone = PushBall::new(&task, std::iter::once(stream), false).unwrap();
+            let mut alone = new_env(&task, std::iter::once(stream), false).unwrap();
             let alone = run(&mut alone, &goals, 0, 40, |step, k| action(step, b as u32, k));
             for (all, one) in together[..121].iter().zip(&alone[..121]) {
                 assert_eq!(all[b * one.len()..(b + 1) * one.len()], one[..], "N = {agents}, episode {b}");
@@ -225,12 +226,13 @@ fn cells_and_lanes_give_the_same_bits() {
     for (agents, side) in [(1, 2.0), (7, 2.5), (60, 6.0), (150, 9.0)] {
         let mut task = task(agents, Spawn::Uniform);
         task.side = side;
-        let mut lanes = PushBall::new(&task, streams(1), false).unwrap();
-        let (positions, landmarks) = (lanes.positions(), lanes.landmarks().to_vec());
+        let mut lanes = new_env(&task, streams(1), false).unwrap();
+        let (positions, landmarks) = (lanes.positions(), lanes.statics().get(LANDMARKS).to_vec());
         let rest = vec![0.0; positions.len()];
-        let mut cells = PushBall::new(&task, streams(1), false).unwrap();
-        lanes.rules = Box::new(Batch::<f32, LANES>::new(&task, &positions, &rest, landmarks.clone(), false).unwrap());
-        cells.rules = Box::new(Batch::<f32, 1>::new(&task, &positions, &rest, landmarks, true).unwrap());
+        let mut cells = new_env(&task, streams(1), false).unwrap();
+        let starts = Starts::given(&task, [&positions, &rest, &landmarks]).unwrap();
+        lanes.rules = Box::new(Batch::<LANES, PushBallObjective<LANES>>::new(&task, &starts, false).unwrap());
+        cells.rules = Box::new(Batch::<1, PushBallObjective<1>>::new(&task, &starts, true).unwrap());
         let table = |step, k| action(step, 0, k);
         let goals = own(1, agents);
         assert_eq!(run(&mut lanes, &goals, 0, 60, table), run(&mut cells, &goals, 0, 60, table), "N = {agents}");
@@ -251,7 +253,7 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
         // All agents stand on landmarks, which does not count; the first one is behind its ball.
         let agents_at: Vec<f32> = (0..agents).flat_map(|k| [balls[2 * k], if k == 0 { -0.3 } else { 60.0 }]).collect();
         let positions = [agents_at, balls].concat();
-        let mut env = PushBall::from_state(&task, &positions, &vec![0.0; 4 * agents], &landmarks).unwrap();
+        let mut env = env_from_state(&task, &positions, &vec![0.0; 4 * agents], &landmarks).unwrap();
         env.set_goals(&own(1, agents)).unwrap();
         let mut actions = vec![0; agents];
         actions[0] = 3;
@@ -271,7 +273,7 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
 fn the_numbers_of_an_episode_are_pinned() {
     // Any change here changes every run: raise magex_core::task::TASK_SEMANTICS with it.
     let digest = |agents: usize, spawn: Spawn, training: bool| {
-        let mut env = PushBall::new(&task(agents, spawn), streams(3), training).unwrap();
+        let mut env = new_env(&task(agents, spawn), streams(3), training).unwrap();
         let log = run(&mut env, &own(3, agents), 0, 80, |step, k| action(step, 0, k));
         log.iter()
             .flatten()
@@ -293,50 +295,56 @@ fn the_numbers_of_an_episode_are_pinned() {
 #[test]
 fn wrong_calls_are_named_and_change_nothing() {
     let task = task(5, Spawn::Uniform);
-    let mut env = PushBall::new(&task, streams(2), false).unwrap();
+    let mut env = new_env(&task, streams(2), false).unwrap();
     let before = env.positions();
     let mut rewards = [0.0; 10];
-    assert_eq!(env.step(&[0; 10], &mut rewards), Err(EnvError::GoalsNotSet));
-    assert!(matches!(env.set_goals(&[0; 10]), Err(EnvError::Length { field: "goals", found: 10, expected: 20 })));
+    assert_eq!(
+        env.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("goals", "not set; call set_goals before the first step"))
+    );
+    assert_eq!(env.set_goals(&[0; 10]), Err(FieldError::new("goals", "10 entries, the shape asks for 20")));
     let mut goals = own(2, 5);
     goals[6] = 5;
-    assert_eq!(env.set_goals(&goals), Err(EnvError::Ball { place: 6, goal: 5, balls: 5 }));
+    assert_eq!(env.set_goals(&goals), Err(FieldError::new("goals[6]", "5 is not a ball; use an index below 5")));
     goals[6] = 4;
     goals[13] = 7;
-    assert_eq!(env.set_goals(&goals), Err(EnvError::Goal { place: 13, goal: 7, landmarks: 5 }));
+    assert_eq!(env.set_goals(&goals), Err(FieldError::new("goals[13]", "7 is not a landmark; use an index below 5")));
     goals[13] = 0;
     env.set_goals(&goals).unwrap();
     let mut actions = [1; 10];
     actions[3] = 5;
-    assert_eq!(env.step(&actions, &mut rewards), Err(EnvError::Action { place: 3, action: 5 }));
+    assert_eq!(
+        env.step(&actions, &mut rewards),
+        Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y"))
+    );
     assert!(env.step(&[0; 9], &mut rewards).is_err());
     assert!(env.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(env.write_positions(&mut [0.0; 20]).is_err() && env.write_velocities(&mut [0.0; 41]).is_err());
     assert!(env.write_agent_state(&mut [0.0]).is_err() && env.write_agent_state(&mut []).is_ok());
-    assert_eq!((env.positions(), env.steps()), (before, 0));
+    assert_eq!((env.positions(), env.steps), (before, 0));
     for _ in 0..task.horizon {
         env.step(&[0; 10], &mut rewards).unwrap();
     }
-    assert_eq!(env.step(&[0; 10], &mut rewards), Err(EnvError::EpisodeOver { horizon: 100 }));
+    assert_eq!(
+        env.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("step", "the episode is over after 100 steps; start a new batch"))
+    );
     let mut positions = [0.0; 20];
     positions[19] = f32::NAN;
-    let bad = PushBall::from_state(&task, &positions, &[0.0; 20], &[0.0; 10]);
-    assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 19, .. })));
-    assert!(PushBall::from_state(&task, &[0.0; 10], &[0.0; 20], &[0.0; 10]).is_err());
+    let bad = env_from_state(&task, &positions, &[0.0; 20], &[0.0; 10]);
+    assert_eq!(bad.err(), Some(FieldError::new("positions[19]", "NaN is not finite")));
+    assert!(env_from_state(&task, &[0.0; 10], &[0.0; 20], &[0.0; 10]).is_err());
     let mut task = task;
     task.settings = TaskSettings::PushBall(PushBallConfig { start_in_line_fraction: 1.5, ..PushBallConfig::default() });
     assert!(
-        PushBall::new(&task, streams(1), true)
-            .unwrap_err()
-            .to_string()
-            .contains("task.push_ball.start_in_line_fraction")
+        new_env(&task, streams(1), true).err().unwrap().to_string().contains("task.push_ball.start_in_line_fraction")
     );
 }
 
 #[test]
 fn a_batch_of_nothing_is_fine() {
-    let mut env = PushBall::new(&task(5, Spawn::Uniform), streams(0), false).unwrap();
+    let mut env = new_env(&task(5, Spawn::Uniform), streams(0), false).unwrap();
     env.set_goals(&[]).unwrap();
     env.step(&[], &mut []).unwrap();
-    assert_eq!((env.episodes(), env.positions().len(), env.scores().len()), (0, 0, 0));
+    assert_eq!((env.shape.episodes, env.positions().len(), env.scores().len()), (0, 0, 0));
 }

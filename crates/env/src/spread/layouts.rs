@@ -8,26 +8,23 @@ use magex_core::task::TaskConfig;
 
 /// Where the agents and the landmarks of one layout are.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Layout {
+pub(super) struct Layout {
     /// The paper's orange points; N in all.
-    pub agents: Points,
+    pub(super) agents: Points,
     /// The paper's blue points; N in all.
-    pub landmarks: Points,
+    pub(super) landmarks: Points,
 }
 
 /// The sizes that tell the two sets apart.
 struct Set {
-    /// Half the length of the agents' lines.
     half: f64,
     /// Height of the agents' lines in layouts 0 and 1.
     heights: [f64; 2],
-    /// Radii of the agents' circles.
     circles: [f64; 2],
     /// Half the distance between the two landmark lines of layout 1, and half their length.
     columns: f64,
     /// Half the side of the landmarks' square; its corners are left free.
     square: f64,
-    /// Radius of the landmarks' circle.
     circle: f64,
 }
 
@@ -42,7 +39,7 @@ const SMALL_UP_TO: usize = 20;
 
 /// Layout `index` (modulo 4) for N agents and landmarks, in raw units. Curves share N as evenly as they can, the
 /// first ones taking the remainder.
-pub fn layout(index: u8, n: usize) -> Layout {
+pub(super) fn layout(index: u8, n: usize) -> Layout {
     let set = if n <= SMALL_UP_TO { &SMALL } else { &LARGE };
     let index = index % LAYOUTS;
     let horizontal = |y: f64, half: f64| Curve::Segment { from: [-half, y], to: [half, y] };
@@ -73,7 +70,7 @@ fn share(curves: Vec<Curve>, n: usize) -> Points {
 
 /// World units per raw unit: the task's `layout_scale` for the authors' sizes (20 and 50), else whatever makes the
 /// widest layout of the set as wide as the map.
-pub fn scale(task: &TaskConfig) -> f64 {
+pub(super) fn scale(task: &TaskConfig) -> f64 {
     match task.agents {
         20 | 50 => 1.0 / f64::from(task.layout_scale),
         n => {

@@ -1,5 +1,6 @@
 use super::*;
-use crate::env::Env as _;
+use crate::env::Env;
+use crate::tasks::{env_from_state, new_env};
 use magex_core::metrics_table::{ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{RewardConfig, Spawn, TaskSettings};
@@ -13,14 +14,14 @@ fn task(agents: usize) -> TaskConfig {
 }
 
 /// Three agents at rest: two overlapping ones and one on its landmark.
-fn hand_made() -> (TaskConfig, Spread) {
+fn hand_made() -> (TaskConfig, Env) {
     let mut task = task(3);
     task.side = 4.0;
     task.settings =
         TaskSettings::SimpleSpread(RewardConfig { bonus: 3.0, distance: 0.5, collision: 0.25, distance_unit: 2.0 });
     let positions = [0.0, 0.0, 0.125, 0.0, 1.5, 1.5];
     let landmarks = [1.0, 0.0, -1.0, 0.0, 1.5, 1.5];
-    let spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
+    let spread = env_from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
     (task, spread)
 }
 
@@ -47,7 +48,7 @@ fn overlapping_agents_pay_for_each_other_and_not_for_themselves() {
     let mut task = task(3);
     task.side = 4.0;
     let positions = [0.0, 0.0, 0.1, 0.0, 0.2, 0.0];
-    let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &positions).unwrap();
+    let mut spread = env_from_state(&task, &positions, &[0.0; 6], &positions).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     let mut rewards = [0.0; 3];
     // The outer two are pushed out by 0.1, the middle one stays: no two overlap any more after the step.
@@ -57,7 +58,7 @@ fn overlapping_agents_pay_for_each_other_and_not_for_themselves() {
     assert!(rewards.iter().all(|r| (0.9..=1.0).contains(r)), "{rewards:?}");
     // Driving the left one into the middle one: both pay.
     let positions = [0.0, 0.0, 0.21, 0.0, 3.0, 0.0];
-    let mut spread = Spread::from_state(&task, &positions, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0], &positions).unwrap();
+    let mut spread = env_from_state(&task, &positions, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0], &positions).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     spread.step(&[1, 0, 0], &mut rewards).unwrap();
     let metrics = spread.scores()[0];
@@ -73,7 +74,7 @@ fn success_counts_any_agent_and_matched_success_only_its_own() {
     task.side = 8.0;
     let positions = [0.0, 0.0, 2.0, 2.0, 3.0, 3.0];
     let landmarks = [-0.1, 0.0, 0.1, 0.0, -3.0, -3.0];
-    let mut spread = Spread::from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
+    let mut spread = env_from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
     spread.set_goals(&[0, 1, 2]).unwrap();
     spread.step(&[0; 3], &mut [0.0; 3]).unwrap();
     let metrics = spread.scores()[0];
@@ -94,7 +95,7 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
             positions[2 * (7 * k + 3) + 1] = 50.0 + k as f32;
         }
         positions[1] = -0.6;
-        let mut spread = Spread::from_state(&task, &positions, &vec![0.0; 2 * agents], &landmarks).unwrap();
+        let mut spread = env_from_state(&task, &positions, &vec![0.0; 2 * agents], &landmarks).unwrap();
         spread.set_goals(&(0..agents as u32).collect::<Vec<_>>()).unwrap();
         let mut actions = vec![0; agents];
         actions[0] = 3;
@@ -116,11 +117,11 @@ fn arrival_is_the_first_step_after_which_enough_landmarks_are_covered() {
 fn an_episode_is_the_same_alone_and_in_any_batch() {
     for (agents, episodes) in [(5, 37), (20, 17), (50, 5), (200, 14)] {
         let task = task(agents);
-        let mut together = Spread::new(&task, streams(episodes), false).unwrap();
+        let mut together = new_env(&task, streams(episodes), false).unwrap();
         let goals: Vec<u32> = (0..episodes).flat_map(|_| (0..agents as u32).rev()).collect();
         together.set_goals(&goals).unwrap();
-        let mut alone: Vec<Spread> =
-            streams(episodes).map(|s| Spread::new(&task, std::iter::once(s), false).unwrap()).collect();
+        let mut alone: Vec<Env> =
+            streams(episodes).map(|s| new_env(&task, std::iter::once(s), false).unwrap()).collect();
         alone.iter_mut().for_each(|spread| spread.set_goals(&goals[..agents]).unwrap());
         let mut stream = Key::new(3, Purpose::Action, &[agents as u32]).stream();
         let mut rewards = vec![0.0; agents * episodes as usize];
@@ -148,7 +149,7 @@ fn the_numbers_of_an_episode_are_pinned() {
     // Any change here changes every run: raise magex_core::task::TASK_SEMANTICS with it.
     let digest = |agents: usize, spawn: Spawn| {
         let task = TaskConfig::simple_spread(agents, spawn);
-        let mut spread = Spread::new(&task, streams(3), false).unwrap();
+        let mut spread = new_env(&task, streams(3), false).unwrap();
         spread.set_goals(&(0..3).flat_map(|_| 0..agents as u32).collect::<Vec<_>>()).unwrap();
         let mut stream = Key::new(3, Purpose::Action, &[]).stream();
         let mut rewards = vec![0.0; 3 * agents];
@@ -178,37 +179,46 @@ fn the_numbers_of_an_episode_are_pinned() {
 #[test]
 fn wrong_calls_are_named_and_change_nothing() {
     let task = task(5);
-    let mut spread = Spread::new(&task, streams(2), false).unwrap();
+    let mut spread = new_env(&task, streams(2), false).unwrap();
     let before = spread.positions();
     let mut rewards = [0.0; 10];
-    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(EnvError::GoalsNotSet));
-    assert!(matches!(spread.set_goals(&[0; 9]), Err(EnvError::Length { field: "goals", found: 9, expected: 10 })));
+    assert_eq!(
+        spread.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("goals", "not set; call set_goals before the first step"))
+    );
+    assert_eq!(spread.set_goals(&[0; 9]), Err(FieldError::new("goals", "9 entries, the shape asks for 10")));
     let mut goals = [4; 10];
     goals[7] = 5;
-    assert!(matches!(spread.set_goals(&goals), Err(EnvError::Goal { place: 7, goal: 5, landmarks: 5 })));
+    assert_eq!(spread.set_goals(&goals), Err(FieldError::new("goals[7]", "5 is not a landmark; use an index below 5")));
     spread.set_goals(&[0; 10]).unwrap();
     let mut actions = [1; 10];
     actions[3] = 5;
-    assert_eq!(spread.step(&actions, &mut rewards), Err(EnvError::Action { place: 3, action: 5 }));
+    assert_eq!(
+        spread.step(&actions, &mut rewards),
+        Err(FieldError::new("actions[3]", "5 is not an action; use 0 none, 1 +x, 2 -x, 3 +y, 4 -y"))
+    );
     assert!(spread.step(&[0; 9], &mut rewards).is_err());
     assert!(spread.step(&[0; 10], &mut rewards[..9]).is_err());
     assert!(spread.write_positions(&mut [0.0; 19]).is_err());
-    assert_eq!((spread.positions(), spread.steps()), (before, 0));
+    assert_eq!((spread.positions(), spread.steps), (before, 0));
     for _ in 0..task.horizon {
         spread.step(&[0; 10], &mut rewards).unwrap();
     }
-    assert_eq!(spread.step(&[0; 10], &mut rewards), Err(EnvError::EpisodeOver { horizon: 60 }));
-    let bad = Spread::from_state(&task, &[f32::NAN; 10], &[0.0; 10], &[0.0; 10]);
-    assert!(matches!(bad, Err(EnvError::NotFinite { field: "positions", place: 0, .. })));
+    assert_eq!(
+        spread.step(&[0; 10], &mut rewards),
+        Err(FieldError::new("step", "the episode is over after 60 steps; start a new batch"))
+    );
+    let bad = env_from_state(&task, &[f32::NAN; 10], &[0.0; 10], &[0.0; 10]);
+    assert_eq!(bad.err(), Some(FieldError::new("positions[0]", "NaN is not finite")));
     let mut task = task;
     task.side = -1.0;
-    assert!(Spread::new(&task, streams(1), false).unwrap_err().to_string().contains("task.side"));
+    assert!(new_env(&task, streams(1), false).err().unwrap().to_string().contains("task.side"));
 }
 
 #[test]
 fn a_batch_of_nothing_is_fine() {
-    let mut spread = Spread::new(&task(5), streams(0), false).unwrap();
+    let mut spread = new_env(&task(5), streams(0), false).unwrap();
     spread.set_goals(&[]).unwrap();
     spread.step(&[], &mut []).unwrap();
-    assert_eq!((spread.episodes(), spread.positions().len()), (0, 0));
+    assert_eq!((spread.shape.episodes, spread.positions().len()), (0, 0));
 }

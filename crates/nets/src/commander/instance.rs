@@ -8,7 +8,6 @@ use wide::f32x16;
 /// What a learned scheduler sees of a team, computed once.
 #[derive(Debug, Clone)]
 pub struct Instance {
-    /// Network input.
     pub(super) features: Vec<f32>,
     /// [rows, columns] what a pair costs more than the row's best (`pairwise` only); the scores are this, refined.
     pub(super) reduced_costs: Vec<f32>,
@@ -16,7 +15,6 @@ pub struct Instance {
     pub(super) candidates: Vec<u32>,
     /// Rows of the score matrix (1 for `ranking`).
     pub(super) rows: usize,
-    /// Columns of the score matrix.
     pub(super) columns: usize,
     /// Which row picks when.
     pub(super) order: PickOrder,
@@ -39,7 +37,6 @@ pub(super) enum PickOrder {
 }
 
 impl Instance {
-    /// Places of the score matrix.
     pub(super) fn cells(&self) -> usize {
         self.rows * self.columns
     }

@@ -1,8 +1,6 @@
-//! The pairwise scorer: a small network that looks at one (agent, goal) pair at a time, so it serves any team size and
-//! does not care about the order of agents and goals.
-//!
-//! Entropic transport prices say how much worse than a global compromise each pair is; the network refines the pairs that
-//! are among the best of their row, and leaves the others as they are.
+//! The pairwise scorer: a small network that looks at one (agent, goal) pair at a time, so it serves any team size in any
+//! order. Entropic transport prices say how much worse than a global compromise each pair is; the network refines the pairs
+//! that are among the best of their row, and leaves the others as they are.
 
 use super::instance::PickOrder;
 use super::{CommanderError, Instance, Team};
@@ -13,7 +11,6 @@ use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
 use magex_assign::duals::sinkhorn_duals;
 
-/// Features of a pair.
 const FEATURES: usize = 10;
 
 /// Pairs of each row that the network looks at: those with the least reduced cost.
@@ -42,7 +39,6 @@ impl PairwiseNet {
         })
     }
 
-    /// Flat scores of several instances.
     pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
         let cells = instances.iter().map(Instance::cells).sum();
         let mut reduced_costs = Vec::with_capacity(cells);

@@ -24,7 +24,6 @@ pub struct Model {
     config: ExecutorConfig,
     spec: FeatureSpec,
     heads: ActionHeads,
-    agents: usize,
 }
 
 /// Policy and value function are two networks. Their order is that of their keys: 0 and 1.
@@ -38,7 +37,7 @@ impl Model {
         let heads = ActionHeads::new(config.task.action_heads())
             .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))?;
         let spec = feature_spec(&config.executor, &config.task);
-        Ok(Self { config: config.executor.clone(), spec, heads, agents: config.task.agents })
+        Ok(Self { config: config.executor.clone(), spec, heads })
     }
 
     /// What the networks see.
@@ -93,6 +92,6 @@ impl Model {
     }
 
     fn network(&self, part: &mut ParamBuilder, outputs: usize, gain: f64) -> Result<Box<dyn Network>, ParamError> {
-        build(&self.config, &self.spec, self.agents, outputs, gain, part)
+        build(&self.config, &self.spec, outputs, gain, part)
     }
 }

@@ -11,13 +11,6 @@ pub trait Chooser {
     fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8];
 }
 
-/// What acting leaves behind beside the actions, which the [`Chooser`] has.
-#[derive(Debug)]
-pub struct Acted {
-    /// [L, C·N, H] states of the memory after each step; `None` for networks without memory.
-    pub states: Option<Tensor>,
-}
-
 /// What a policy thinks of given actions, differentiable in its parameters.
 #[derive(Debug)]
 pub struct Evaluated {
@@ -33,8 +26,9 @@ pub struct Evaluated {
 /// `act` shows the logits of a row to the chooser before it computes those of the next one, `evaluate` is given all actions.
 /// Both give the same log-probabilities for the same actions, to the bit: the first importance ratio is exactly 1.
 pub trait Policy: Send + Sync {
-    /// Chooses an action for every row of the batch.
-    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted>;
+    /// Chooses an action for every row of the batch. Returns the states of the memory after each step, [L, C·N, H]; `None`
+    /// for networks without memory.
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>>;
 
     /// Evaluates the actions [R, H] of every row of the batch.
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated>;
@@ -47,14 +41,14 @@ pub struct Independent {
 }
 
 impl Policy for Independent {
-    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Acted> {
+    fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>> {
         let output = self.network.forward(input)?;
         with_values(&output.out, |logits| {
             for (row, logits) in logits.chunks_exact(self.heads.logits()).enumerate() {
                 choose.choose(row, logits);
             }
         })?;
-        Ok(Acted { states: output.states })
+        Ok(output.states)
     }
 
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {

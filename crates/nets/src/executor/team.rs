@@ -1,15 +1,12 @@
 //! The paper's executor: Subgraph Extractor, Goal Encoder, State Extractor, Action Generator; and its ablations.
 
-use super::{Input, Layer, Network, Output, RELU_GAIN};
+use super::{Input, Layer, NeighbourEncoder, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::ops::{
-    Activation, GraphBlock, constant, graph_block, gru, layer_norm, linear, mean_of_others, neighbour_pool, softmax,
-};
+use crate::ops::{Activation, GraphBlock, constant, graph_block, gru, layer_norm, linear, mean_of_others, softmax};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
-use std::sync::Arc;
 
 /// Heads and width of a head of the attention ablation (authors' code: 4 × 16).
 const HEADS: usize = 4;
@@ -18,11 +15,18 @@ const HEAD_WIDTH: usize = 16;
 /// Where an agent's team feature E_a comes from.
 enum Team {
     /// Observation Encoder with a fully connected GCN, then hard Gumbel-softmax blocks.
-    Graph { encode: Layer, blocks: Vec<Block>, literal: bool },
-    /// Ablation -Atten.
-    Attention { qkv: Layer, out: Layer },
-    /// Ablation -MLP.
-    Concat { mix: Layer },
+    Graph {
+        encode: Layer,
+        blocks: Vec<Block>,
+        literal: bool,
+    },
+    Attention {
+        qkv: Layer,
+        out: Layer,
+    },
+    Concat {
+        mix: Layer,
+    },
 }
 
 struct Block {
@@ -32,6 +36,35 @@ struct Block {
     relative: Option<Tensor>,
     score: Tensor,
     shape: GraphBlock,
+}
+
+impl Block {
+    fn build(
+        config: &ExecutorConfig,
+        spec: &FeatureSpec,
+        b: usize,
+        params: &mut ParamBuilder,
+    ) -> Result<Self, ParamError> {
+        let (f, p, literal) = (config.feature_size, config.pair_hidden, config.kind == ExecutorKind::MagexLiteral);
+        let (project, relative) = (format!("block{b}.project"), format!("block{b}.relative"));
+        Ok(Self {
+            project: Layer::build(params, &project, (f, 2 * p + 2 * f), Activation::Identity, 1.0)?,
+            relative: if literal {
+                None
+            } else {
+                Some(params.tensor(&relative, &[2 * spec.shape.dims, p], Init::Orthogonal(1.0))?)
+            },
+            score: params.tensor(&format!("block{b}.score"), &[p + 1], Init::Orthogonal(0.5))?,
+            shape: GraphBlock {
+                agents: spec.shape.agents,
+                pair_hidden: p,
+                width: f,
+                block: b as u32,
+                self_path: !literal,
+                temperature: config.temperature,
+            },
+        })
+    }
 }
 
 struct Norm {
@@ -55,12 +88,12 @@ impl Module for Norm {
 }
 
 /// Paper, figure 2. F = feature size.
-pub struct TeamNet {
+pub(super) struct TeamNet {
     observe: Layer,
     team: Team,
     goal: Layer,
     /// Encounter Encoder: Σ over neighbours of relu(neighbour → F / 2), where the task has encounters.
-    encounters: Option<(Tensor, Tensor)>,
+    encounters: Option<NeighbourEncoder>,
     fuse_norm: Option<Norm>,
     state: Layer,
     gates: Layer,
@@ -74,10 +107,9 @@ pub struct TeamNet {
 
 impl TeamNet {
     /// Builds the kind that the configuration names.
-    pub fn build(
+    pub(super) fn build(
         config: &ExecutorConfig,
         spec: &FeatureSpec,
-        agents: usize,
         outputs: usize,
         head_gain: f64,
         params: &mut ParamBuilder,
@@ -95,57 +127,20 @@ impl TeamNet {
                 }
             }
             ExecutorKind::Mlp => {
-                Team::Concat { mix: Layer::build(params, "concat", (agents * f, f), relu, RELU_GAIN)? }
+                Team::Concat { mix: Layer::build(params, "concat", (spec.shape.agents * f, f), relu, RELU_GAIN)? }
             }
             _ => {
                 let literal = config.kind == ExecutorKind::MagexLiteral;
                 let inputs = if literal { f } else { 2 * f };
                 let encode = Layer::build(params, "gcn", (inputs, f), relu, RELU_GAIN)?;
-                let mut blocks = Vec::new();
-                for b in 0..config.graph_blocks {
-                    let name = format!("block{b}");
-                    blocks.push(Block {
-                        project: Layer::build(
-                            params,
-                            &format!("{name}.project"),
-                            (f, 2 * p + 2 * f),
-                            Activation::Identity,
-                            1.0,
-                        )?,
-                        relative: if literal {
-                            None
-                        } else {
-                            Some(params.tensor(
-                                &format!("{name}.relative"),
-                                &[2 * spec.dims, p],
-                                Init::Orthogonal(1.0),
-                            )?)
-                        },
-                        score: params.tensor(&format!("{name}.score"), &[p + 1], Init::Orthogonal(0.5))?,
-                        shape: GraphBlock {
-                            agents: 0,
-                            pair_hidden: p,
-                            width: f,
-                            block: b as u32,
-                            self_path: !literal,
-                            temperature: config.temperature,
-                        },
-                    });
-                }
+                let blocks = (0..config.graph_blocks).map(|b| Block::build(config, spec, b, params));
+                let blocks = blocks.collect::<Result<_, _>>()?;
                 Team::Graph { encode, blocks, literal }
             }
         };
-        let (near, half) = (spec.neighbours > 0, f / 2);
-        let fused = 2 * f + if near { half } else { 0 };
-        let encounters = if near {
-            let width = spec.neighbour_width();
-            Some((
-                params.tensor("f_near.weight", &[width, half], Init::Orthogonal(RELU_GAIN))?,
-                params.tensor("f_near.bias", &[half], Init::Constant(0.0))?,
-            ))
-        } else {
-            None
-        };
+        let near = spec.neighbours > 0;
+        let fused = 2 * f + if near { f / 2 } else { 0 };
+        let encounters = if near { Some(NeighbourEncoder::build(params, "f_near", spec, f / 2)?) } else { None };
         Ok(Self {
             observe,
             team,
@@ -181,7 +176,7 @@ impl TeamNet {
                 } else {
                     encode.forward(&Tensor::cat(&[&x, &others], 1)?)?
                 };
-                let pairs = constant(features.pairs.as_slice(), 2 * self.spec.dims)?;
+                let pairs = constant(features.pairs.as_slice(), 2 * self.spec.shape.dims)?;
                 let zeros = Tensor::zeros(self.pair_hidden, DType::F32, &Device::Cpu)?;
                 for block in blocks {
                     let projected = block.project.forward(&h)?;
@@ -189,8 +184,7 @@ impl TeamNet {
                         Some(w) => linear(&pairs, w, &zeros, Activation::Identity, true)?,
                         None => Tensor::zeros((pairs.dim(0)?, self.pair_hidden), DType::F32, &Device::Cpu)?,
                     };
-                    let shape = GraphBlock { agents: n, ..block.shape.clone() };
-                    h = graph_block(&projected, &relative, &block.score, shape, input.noise.clone())?;
+                    h = graph_block(&projected, &relative, &block.score, block.shape.clone(), input.noise.clone())?;
                 }
                 Ok(h)
             }
@@ -210,10 +204,8 @@ impl TeamNet {
             Team::Concat { mix } => {
                 let states = x.dim(0)? / n;
                 let team = mix.forward(&x.reshape((states, n * self.width))?)?;
-                team.unsqueeze(1)?
-                    .broadcast_as((states, n, self.width))?
-                    .contiguous()?
-                    .reshape((states * n, self.width))
+                let copies = team.unsqueeze(1)?.broadcast_as((states, n, self.width))?.contiguous()?;
+                copies.reshape((states * n, self.width))
             }
         }
     }
@@ -226,12 +218,7 @@ impl Network for TeamNet {
         let goal = self.goal.forward(&constant(input.features.goals.as_slice(), self.spec.goal_width())?)?;
         let mut fused = match &self.encounters {
             None => Tensor::cat(&[&goal, &team], 1)?,
-            Some((w, b)) => {
-                let f = input.features;
-                let shape = (f.counts.len(), self.spec.neighbours, self.spec.neighbour_width());
-                let near = Tensor::from_slice(&f.neighbours, shape, &Device::Cpu)?;
-                Tensor::cat(&[&goal, &team, &neighbour_pool(&near, Arc::new(f.counts.clone()), w, b)?], 1)?
-            }
+            Some(encoder) => Tensor::cat(&[&goal, &team, &encoder.forward(input.features)?], 1)?,
         };
         if let Some(norm) = &self.fuse_norm {
             fused = norm.forward(&fused)?;

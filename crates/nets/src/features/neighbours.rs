@@ -1,6 +1,6 @@
 //! The bodies around an agent, one by one.
 
-use super::{FeatureSpec, State, Symmetry};
+use super::{FeatureSpec, State, Symmetry, offset};
 
 /// Encounters farther ahead than this do not matter, seconds.
 const AHEAD: f32 = 2.0;
@@ -15,14 +15,15 @@ impl FeatureSpec {
         out: &mut [f32],
         counts: &mut [u8],
     ) {
-        let (d, k, reach) = (self.dims, self.neighbours, self.observation.sensing_radius);
+        let (d, k, reach) = (self.shape.dims, self.neighbours, self.observation.sensing_radius);
         let p = state.p;
         let width = self.neighbour_width();
-        let gone = |j: usize| j < self.agents && self.observation.out.is_some_and(|flag| state.extra(j)[flag] > 0.0);
+        let gone =
+            |j: usize| j < self.shape.agents && self.observation.out.is_some_and(|flag| state.extra(j)[flag] > 0.0);
         // Bodies sorted along x: only those within reach of one another on this axis are looked at.
-        let mut order: Vec<usize> = (0..self.bodies()).filter(|&j| !gone(j)).collect();
+        let mut order: Vec<usize> = (0..self.shape.bodies).filter(|&j| !gone(j)).collect();
         order.sort_by(|&a, &b| p[a * d].total_cmp(&p[b * d]).then(a.cmp(&b)));
-        for (at, &i) in order.iter().enumerate().filter(|(_, i)| **i < self.agents) {
+        for (at, &i) in order.iter().enumerate().filter(|(_, i)| **i < self.shape.agents) {
             near.clear();
             let own = if self.pushes() { state.target_body(i, 0) } else { None };
             let mut look = |j: usize| -> bool {
@@ -65,12 +66,9 @@ impl FeatureSpec {
     /// Body j as agent i sees it.
     fn neighbour(&self, state: &State<'_>, (i, j): (usize, usize), square: f32, symmetry: Symmetry, out: &mut [f32]) {
         let o = &self.observation;
-        let d = self.dims;
-        let (mut offset, mut velocity) = ([0.0f32; 3], [0.0f32; 3]);
-        for c in 0..d {
-            offset[c] = state.p[j * d + c] - state.p[i * d + c];
-            velocity[c] = state.v[j * d + c] - state.v[i * d + c];
-        }
+        let d = self.shape.dims;
+        let (offset, velocity) =
+            (offset(state.position(i), state.position(j)).0, offset(state.velocity(i), state.velocity(j)).0);
         let (offset, velocity) = (symmetry.see(offset), symmetry.see(velocity));
         for c in 0..d {
             out[c] = offset[c];
@@ -95,8 +93,8 @@ impl FeatureSpec {
             out[at + d + 1] = (o.contact_radius / nearest.sqrt().max(1e-6)).min(2.0);
             at += d + 2;
         }
-        if self.balls > 0 {
-            out[at] = if j < self.agents { 0.0 } else { 1.0 };
+        if self.shape.bodies > self.shape.agents {
+            out[at] = if j < self.shape.agents { 0.0 } else { 1.0 };
         }
     }
 }

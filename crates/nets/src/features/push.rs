@@ -16,7 +16,7 @@ pub(super) const fn width(dims: usize) -> usize {
 impl FeatureSpec {
     /// Whether an agent's way leads to a ball and with it to a landmark.
     pub(super) fn pushes(&self) -> bool {
-        self.balls > 0 && self.goals_per_agent == 2
+        self.shape.bodies > self.shape.agents && self.shape.goals_per_agent == 2
     }
 
     /// The frame that agent i sees the world in.
@@ -24,7 +24,7 @@ impl FeatureSpec {
         match self.observation.frame {
             Frame::World => Symmetry::default(),
             Frame::Push => {
-                let (ball, landmark) = (state.target(i, 0), state.target(i, self.goals_per_agent - 1));
+                let (ball, landmark) = (state.target(i, 0), state.target(i, self.shape.goals_per_agent - 1));
                 Symmetry::facing(offset(ball, landmark).0, offset(state.position(i), ball).0)
             }
         }
@@ -33,14 +33,14 @@ impl FeatureSpec {
     /// Squashed offset to the agent's ball, along the axes of the world.
     pub(super) fn ball_offset(&self, state: &State<'_>, i: usize, out: &mut Vec<f32>) {
         let (offset, distance) = offset(state.position(i), state.target(i, 0));
-        out.extend(offset[..self.dims].iter().map(|x| x / (1.0 + distance)));
+        out.extend(offset[..self.shape.dims].iter().map(|x| x / (1.0 + distance)));
     }
 
     /// The agent, its ball, that ball's landmark: [`width()`] numbers.
     pub(super) fn push_features(&self, state: &State<'_>, i: usize, symmetry: Symmetry, out: &mut Vec<f32>) {
         let o = &self.observation;
         let (p, v) = (state.position(i), state.velocity(i));
-        let put = |vector: [f32; 3], scale: f32, out: &mut Vec<f32>| symmetry.put(vector, scale, self.dims, out);
+        let put = |vector: [f32; 3], scale: f32, out: &mut Vec<f32>| symmetry.put(vector, scale, self.shape.dims, out);
         let (ball, landmark) = (state.target(i, 0), state.target(i, 1));
         put(padded(v), 1.0 / o.speed, out);
         let (to_ball, near) = offset(p, ball);

@@ -9,7 +9,7 @@ fn spec(neighbours: usize, agents: usize) -> FeatureSpec {
 
 /// Features of particle states whose episodes have these landmarks.
 fn see(spec: &FeatureSpec, positions: &[f32], velocities: &[f32], landmarks: &[f32], goals: &[u32]) -> Features {
-    let statics = Statics::landmarks(spec.landmarks, 2, landmarks.to_vec());
+    let statics = Statics::landmarks(spec.shape.landmarks, 2, landmarks.to_vec());
     spec.compute(&JointState { positions, velocities, agent_state: &[], statics: statics.view(), goals })
 }
 

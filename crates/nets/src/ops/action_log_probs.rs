@@ -1,14 +1,14 @@
+use super::operation::{Arg, Operation, apply1};
 use super::simd::load;
-use super::{slice, with_values};
 use crate::distribution::ActionHeads;
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::OnceLock;
 
 /// Log-probabilities and entropies of given actions: [2, R] from logits [R, A] and actions [R, H], both summed over the
 /// components of an action. The log-probabilities have the bits of [`ActionHeads::choose`], so the first importance ratio
 /// is exactly 1.
 pub fn action_log_probs(logits: &Tensor, actions: Vec<u8>, heads: &ActionHeads) -> Result<Tensor> {
-    logits.contiguous()?.apply_op1(ActionLogProbs { actions, heads: heads.clone(), saved: OnceLock::new() })
+    apply1(ActionLogProbs { actions, heads: heads.clone(), saved: OnceLock::new() }, logits)
 }
 
 struct ActionLogProbs {
@@ -18,13 +18,11 @@ struct ActionLogProbs {
     saved: OnceLock<Vec<f32>>,
 }
 
-impl CustomOp1 for ActionLogProbs {
-    fn name(&self) -> &'static str {
-        "action-log-probs"
-    }
+impl Operation<1> for ActionLogProbs {
+    const NAME: &'static str = "action-log-probs";
 
-    fn cpu_fwd(&self, logits: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (rows, width) = layout.shape().dims2()?;
+    fn forward(&self, [logits]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
+        let (rows, width) = logits.rows();
         let components = self.heads.count();
         if width != self.heads.logits() || self.actions.len() != rows * components {
             bail!("action log-probs: {} actions and logits [{rows}, {width}] do not fit", self.actions.len());
@@ -32,7 +30,8 @@ impl CustomOp1 for ActionLogProbs {
         let mut out = vec![0.0; 2 * rows];
         let mut saved = vec![0.0; 2 * rows * width];
         let (log_probs_out, entropies) = out.split_at_mut(rows);
-        for (((logits, action), saved), (log_prob, entropy)) in slice(logits, layout)?
+        for (((logits, action), saved), (log_prob, entropy)) in logits
+            .values
             .chunks_exact(width)
             .zip(self.actions.chunks_exact(components))
             .zip(saved.chunks_exact_mut(2 * width))
@@ -54,35 +53,32 @@ impl CustomOp1 for ActionLogProbs {
         }
         // Each call of `action_log_probs` makes its own operation: the cell is empty.
         let _ = self.saved.set(saved);
-        Ok((CpuStorage::F32(out), Shape::from((2, rows))))
+        Ok((out, Shape::from((2, rows))))
     }
 
-    fn bwd(&self, logits: &Tensor, _out: &Tensor, upstream: &Tensor) -> Result<Option<Tensor>> {
-        let (rows, width) = logits.dims2()?;
+    fn backward(&self, [logits]: [Arg<'_>; 1], _y: &[f32], upstream: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
+        let (rows, width) = logits.rows();
         let Some(saved) = self.saved.get() else { bail!("action log-probs: gradient without forward") };
-        let gradient = with_values(&upstream.contiguous()?, |upstream| {
-            let (d_log_probs, d_entropies) = upstream.split_at(rows);
-            let mut gradient = vec![0.0; rows * width];
-            for (((gradient, saved), action), (d_log_prob, d_entropy)) in gradient
-                .chunks_exact_mut(width)
-                .zip(saved.chunks_exact(2 * width))
-                .zip(self.actions.chunks_exact(self.heads.count()))
-                .zip(d_log_probs.iter().zip(d_entropies))
-            {
-                let (log_probs, probs) = saved.split_at(width);
-                let mut at = 0;
-                for (&choice, &size) in action.iter().zip(self.heads.sizes()) {
-                    let entropy = head_entropy(&log_probs[at..at + size], &probs[at..at + size]);
-                    for j in at..at + size {
-                        gradient[j] = -probs[j] * (d_log_prob + d_entropy * (log_probs[j] + entropy));
-                    }
-                    gradient[at + usize::from(choice)] += d_log_prob;
-                    at += size;
+        let (d_log_probs, d_entropies) = upstream.split_at(rows);
+        let mut gradient = vec![0.0; rows * width];
+        for (((gradient, saved), action), (d_log_prob, d_entropy)) in gradient
+            .chunks_exact_mut(width)
+            .zip(saved.chunks_exact(2 * width))
+            .zip(self.actions.chunks_exact(self.heads.count()))
+            .zip(d_log_probs.iter().zip(d_entropies))
+        {
+            let (log_probs, probs) = saved.split_at(width);
+            let mut at = 0;
+            for (&choice, &size) in action.iter().zip(self.heads.sizes()) {
+                let entropy = head_entropy(&log_probs[at..at + size], &probs[at..at + size]);
+                for j in at..at + size {
+                    gradient[j] = -probs[j] * (d_log_prob + d_entropy * (log_probs[j] + entropy));
                 }
+                gradient[at + usize::from(choice)] += d_log_prob;
+                at += size;
             }
-            gradient
-        })?;
-        Ok(Some(Tensor::from_vec(gradient, (rows, width), logits.device())?))
+        }
+        Ok([Some(gradient)])
     }
 }
 

@@ -1,16 +1,16 @@
+use super::operation::{Arg, Operation, apply1};
 use super::simd::{self, LANES, load, store};
-use super::{slice, values};
-use candle_core::{CpuStorage, CustomOp1, D, Layout, Result, Shape, Tensor};
+use candle_core::{D, Result, Shape, Tensor};
 use wide::f32x16;
 
 /// eˣ with the same bits on every machine (candle's calls the platform's libm). NaN, overflow and underflow as in IEEE.
 pub fn exp(x: &Tensor) -> Result<Tensor> {
-    x.contiguous()?.apply_op1(Elementwise::Exp)
+    apply1(Elementwise::Exp, x)
 }
 
 /// Hyperbolic tangent with the same bits on every machine.
 pub fn tanh(x: &Tensor) -> Result<Tensor> {
-    x.contiguous()?.apply_op1(Elementwise::Tanh)
+    apply1(Elementwise::Tanh, x)
 }
 
 /// Softmax over the last dimension, on [`exp()`].
@@ -25,35 +25,26 @@ enum Elementwise {
     Tanh,
 }
 
-impl CustomOp1 for Elementwise {
-    fn name(&self) -> &'static str {
-        match self {
-            Self::Exp => "exp",
-            Self::Tanh => "tanh",
-        }
-    }
+impl Operation<1> for Elementwise {
+    const NAME: &'static str = "elementwise";
 
-    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = slice(x, layout)?;
-        let mut y = vec![0.0; x.len()];
+    fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
+        let mut y = vec![0.0; x.values.len()];
         let f = match self {
             Self::Exp => f32x16::exp,
             Self::Tanh => simd::tanh,
         };
-        for (x, y) in x.chunks(LANES).zip(y.chunks_mut(LANES)) {
+        for (x, y) in x.values.chunks(LANES).zip(y.chunks_mut(LANES)) {
             store(f(load(x)), y);
         }
-        Ok((CpuStorage::F32(y), layout.shape().clone()))
+        Ok((y, Shape::from(x.dims)))
     }
 
-    fn bwd(&self, _x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let mut dx = values(dy)?;
-        for (d, y) in dx.iter_mut().zip(values(y)?) {
-            *d *= match self {
-                Self::Exp => y,
-                Self::Tanh => 1.0 - y * y,
-            };
-        }
-        Ok(Some(Tensor::from_vec(dx, y.shape(), y.device())?))
+    fn backward(&self, _: [Arg<'_>; 1], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
+        let dx = y.iter().zip(dy).map(|(y, d)| match self {
+            Self::Exp => d * y,
+            Self::Tanh => d * (1.0 - y * y),
+        });
+        Ok([Some(dx.collect())])
     }
 }

@@ -1,6 +1,6 @@
+use super::operation::{Arg, Operation, apply3};
 use super::simd::{LANES, load, sigmoid, store, sum};
-use super::{slice, values, with_values};
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::Arc;
 use wide::f32x16;
 
@@ -44,7 +44,7 @@ pub fn graph_block(
     block: GraphBlock,
     noise: GraphNoise,
 ) -> Result<Tensor> {
-    features.contiguous()?.apply_op3(relative, score, Op { block, noise })
+    apply3(Op { block, noise }, [features, relative, score])
 }
 
 struct Op {
@@ -181,7 +181,7 @@ impl Op {
         degree
     }
 
-    fn forward(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
+    fn aggregate(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
         let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
         let states = features.len() / (n * columns);
         let mut y = vec![0.0; states * n * width];
@@ -204,16 +204,13 @@ impl Op {
         y
     }
 
-    fn backward(&self, features: &[f32], relative: &[f32], score: &[f32], y: &[f32], dy: &[f32]) -> Gradients {
+    /// Gradients of features, relative and score.
+    fn gradients(&self, features: &[f32], relative: &[f32], score: &[f32], y: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
         let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
         let states = features.len() / (n * columns);
         let mut scratch = self.scratch();
         let padded = scratch.padded;
-        let mut out = Gradients {
-            features: vec![0.0; features.len()],
-            relative: vec![0.0; relative.len()],
-            score: vec![0.0; p + 1],
-        };
+        let (mut all_d_features, mut d_relative) = (vec![0.0; features.len()], vec![0.0; relative.len()]);
         let mut d_score = vec![f32x16::ZERO; p + 1];
         let (mut z, mut d_z) = (vec![0.0; width * padded], vec![0.0; n * width]);
         let mut d_receiver = vec![f32x16::ZERO; p * padded / LANES];
@@ -222,7 +219,7 @@ impl Op {
         let mut d_sender = vec![f32x16::ZERO; p];
         for s in 0..states {
             let features = &features[s * n * columns..(s + 1) * n * columns];
-            let d_features = &mut out.features[s * n * columns..(s + 1) * n * columns];
+            let d_features = &mut all_d_features[s * n * columns..(s + 1) * n * columns];
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
             for j in 0..n {
                 for k in 0..width {
@@ -286,7 +283,7 @@ impl Op {
                 for k in 0..p {
                     let d = sum(d_sender[k]);
                     d_features[i * columns + k] = d;
-                    out.relative[(s * n + i) * p + k] = -d;
+                    d_relative[(s * n + i) * p + k] = -d;
                 }
             }
             for k in 0..p {
@@ -295,7 +292,7 @@ impl Op {
                         let j = v + lane;
                         if j < n {
                             d_features[j * columns + p + k] = d;
-                            out.relative[(s * n + j) * p + k] += d;
+                            d_relative[(s * n + j) * p + k] += d;
                         }
                     }
                 }
@@ -305,10 +302,7 @@ impl Op {
                     .copy_from_slice(&d_z[j * width..(j + 1) * width]);
             }
         }
-        for (d, v) in out.score.iter_mut().zip(d_score) {
-            *d = sum(v);
-        }
-        out
+        [all_d_features, d_relative, d_score.into_iter().map(sum).collect()]
     }
 }
 
@@ -373,12 +367,6 @@ impl Op {
     }
 }
 
-struct Gradients {
-    features: Vec<f32>,
-    relative: Vec<f32>,
-    score: Vec<f32>,
-}
-
 /// All-ones lanes for neighbours that exist and are not agent i itself.
 #[inline(always)]
 fn present(i: usize, v: usize, n: usize) -> f32x16 {
@@ -404,55 +392,28 @@ fn logistic(key: u64, counter: u32) -> f32x16 {
     u.ln() - (f32x16::ONE - u).ln()
 }
 
-impl CustomOp3 for Op {
-    fn name(&self) -> &'static str {
-        "graph-block"
-    }
+impl Operation<3> for Op {
+    const NAME: &'static str = "graph-block";
 
-    fn cpu_fwd(
-        &self,
-        features: &CpuStorage,
-        lf: &Layout,
-        relative: &CpuStorage,
-        lr: &Layout,
-        score: &CpuStorage,
-        ls: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (rows, columns) = lf.shape().dims2()?;
-        let (n, p) = (self.block.agents, self.block.pair_hidden);
+    fn forward(&self, [features, relative, score]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
+        let ((rows, columns), n, p) = (features.rows(), self.block.agents, self.block.pair_hidden);
         if n == 0 || rows % n != 0 || columns != self.columns() {
             bail!("graph block: features [{rows}, {columns}] do not fit {n} agents, {p} pair units");
         }
-        if lr.shape().dims() != [rows, p] || ls.shape().dims() != [p + 1] {
-            bail!("graph block: relative {:?} or score {:?} do not fit", lr.dims(), ls.dims());
+        if relative.dims != [rows, p] || score.dims != [p + 1] {
+            bail!("graph block: relative {:?} or score {:?} do not fit", relative.dims, score.dims);
         }
         if let GraphNoise::Keyed(keys) = &self.noise
             && keys.len() != rows / n
         {
             bail!("graph block: {} noise keys for {} joint states", keys.len(), rows / n);
         }
-        let y = self.forward(slice(features, lf)?, slice(relative, lr)?, slice(score, ls)?);
-        Ok((CpuStorage::F32(y), Shape::from((rows, self.block.width))))
+        let y = self.aggregate(features.values, relative.values, score.values);
+        Ok((y, Shape::from((rows, self.block.width))))
     }
 
-    fn bwd(
-        &self,
-        features: &Tensor,
-        relative: &Tensor,
-        score: &Tensor,
-        y: &Tensor,
-        dy: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let dy = dy.contiguous()?;
-        let (relative_numbers, score_numbers) = (values(relative)?, values(score)?);
-        let gradients = with_values(features, |f| {
-            with_values(y, |y| with_values(&dy, |dy| self.backward(f, &relative_numbers, &score_numbers, y, dy)))
-        })???;
-        let device = features.device();
-        Ok((
-            Some(Tensor::from_vec(gradients.features, features.shape(), device)?),
-            Some(Tensor::from_vec(gradients.relative, relative.shape(), device)?),
-            Some(Tensor::from_vec(gradients.score, score.shape(), device)?),
-        ))
+    fn backward(&self, args: [Arg<'_>; 3], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
+        let [features, relative, score] = args.map(|arg| arg.values);
+        Ok(self.gradients(features, relative, score, y, dy).map(Some))
     }
 }

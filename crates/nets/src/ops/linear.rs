@@ -1,11 +1,11 @@
 use super::matmul::{Activation, Packed, matmul, weight_gradient};
-use super::{rows, slice, with_values};
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use super::operation::{Arg, Operation, apply3};
+use candle_core::{Result, Shape, Tensor, bail};
 
 /// y [.., n] = act(x [.., k] · w [k, n] + b `[n]`). With `constant_input` no gradient is computed for x: candle would
 /// otherwise compute one even for observations.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, act: Activation, constant_input: bool) -> Result<Tensor> {
-    x.contiguous()?.apply_op3(w, b, Linear { act, constant_input })
+    apply3(Linear { act, constant_input }, [x, w, b])
 }
 
 struct Linear {
@@ -13,56 +13,29 @@ struct Linear {
     constant_input: bool,
 }
 
-impl CustomOp3 for Linear {
-    fn name(&self) -> &'static str {
-        "linear"
-    }
+impl Operation<3> for Linear {
+    const NAME: &'static str = "linear";
 
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        lx: &Layout,
-        w: &CpuStorage,
-        lw: &Layout,
-        b: &CpuStorage,
-        lb: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (k, n) = lw.shape().dims2()?;
-        let mut dims = lx.shape().dims().to_vec();
-        if dims.last() != Some(&k) || lb.shape().dims() != [n] {
-            bail!("linear: x {dims:?}, w [{k}, {n}], b {:?} do not fit", lb.shape().dims());
+    fn forward(&self, [x, w, b]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
+        let ((m, width), (k, n)) = (x.rows(), w.rows());
+        if w.dims.len() != 2 || width != k || b.dims != [n] {
+            bail!("linear: x {:?}, w {:?}, b {:?} do not fit", x.dims, w.dims, b.dims);
         }
-        let m = rows(lx);
         let mut y = vec![0.0; m * n];
-        matmul(slice(x, lx)?, &Packed::new(slice(w, lw)?, k, n), Some(slice(b, lb)?), self.act, &mut y);
-        if let Some(last) = dims.last_mut() {
-            *last = n;
-        }
-        Ok((CpuStorage::F32(y), Shape::from(dims)))
+        matmul(x.values, &Packed::new(w.values, k, n), Some(b.values), self.act, &mut y);
+        let outer = &x.dims[..x.dims.len() - 1];
+        Ok((y, Shape::from([outer, &[n]].concat())))
     }
 
-    fn bwd(
-        &self,
-        x: &Tensor,
-        w: &Tensor,
-        _b: &Tensor,
-        y: &Tensor,
-        dy: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (k, n) = w.dims2()?;
-        let dy = dy.contiguous()?;
-        let dz = with_values(y, |y| with_values(&dy, |dy| self.act.backward(y, dy)))??;
-        let (dw, db) = with_values(x, |x| weight_gradient(x, &dz, k, n))?;
-        let dx = if self.constant_input {
-            None
-        } else {
-            let mut dx = vec![0.0; x.elem_count()];
-            let packed = with_values(w, |w| Packed::transposed(w, k, n))?;
-            matmul(&dz, &packed, None, Activation::Identity, &mut dx);
-            Some(Tensor::from_vec(dx, x.shape(), x.device())?)
-        };
-        let dw = Tensor::from_vec(dw, (k, n), w.device())?;
-        let db = Tensor::from_vec(db, n, w.device())?;
-        Ok((dx, Some(dw), Some(db)))
+    fn backward(&self, [x, w, _]: [Arg<'_>; 3], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
+        let (k, n) = w.rows();
+        let dz = self.act.backward(y, dy);
+        let (dw, db) = weight_gradient(x.values, &dz, k, n);
+        let dx = (!self.constant_input).then(|| {
+            let mut dx = vec![0.0; x.values.len()];
+            matmul(&dz, &Packed::transposed(w.values, k, n), None, Activation::Identity, &mut dx);
+            dx
+        });
+        Ok([dx, Some(dw), Some(db)])
     }
 }

@@ -1,11 +1,11 @@
+use super::operation::{Arg, Operation, apply3};
 use super::simd::{LANES, load, store, sum};
-use super::{rows, slice, with_values};
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 use wide::f32x16;
 
 /// Layer normalisation over the last dimension with scale and shift `[n]`; ε = 1e-5. Unlike candle-nn's it has a gradient.
 pub fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
-    x.contiguous()?.apply_op3(scale, shift, LayerNorm)
+    apply3(LayerNorm, [x, scale, shift])
 }
 
 struct LayerNorm;
@@ -42,26 +42,16 @@ fn centred(chunk: &[f32], mean: f32) -> f32x16 {
     }
 }
 
-impl CustomOp3 for LayerNorm {
-    fn name(&self) -> &'static str {
-        "layer-norm"
-    }
+impl Operation<3> for LayerNorm {
+    const NAME: &'static str = "layer-norm";
 
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        lx: &Layout,
-        scale: &CpuStorage,
-        ls: &Layout,
-        shift: &CpuStorage,
-        lb: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let n = lx.shape().dims().last().copied().unwrap_or(0);
-        if ls.shape().dims() != [n] || lb.shape().dims() != [n] {
+    fn forward(&self, [x, scale, shift]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
+        let (rows, n) = x.rows();
+        if scale.dims != [n] || shift.dims != [n] {
             bail!("layer norm: scale and shift must have {n} entries");
         }
-        let (x, scale, shift) = (slice(x, lx)?, slice(scale, ls)?, slice(shift, lb)?);
-        let mut y = vec![0.0; rows(lx) * n];
+        let (shape, x, scale, shift) = (Shape::from(x.dims), x.values, scale.values, shift.values);
+        let mut y = vec![0.0; rows * n];
         for (row, out) in x.chunks_exact(n).zip(y.chunks_exact_mut(n)) {
             let (mean, inverse) = moments(row);
             let inverse = f32x16::splat(inverse);
@@ -71,56 +61,37 @@ impl CustomOp3 for LayerNorm {
                 store(normal.mul_add(load(&scale[i..to]), load(&shift[i..to])), &mut out[i..to]);
             }
         }
-        Ok((CpuStorage::F32(y), lx.shape().clone()))
+        Ok((y, shape))
     }
 
-    fn bwd(
-        &self,
-        x: &Tensor,
-        scale: &Tensor,
-        _shift: &Tensor,
-        _y: &Tensor,
-        dy: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let n = scale.elem_count();
-        let dy = dy.contiguous()?;
-        let gains = scale.to_vec1::<f32>()?;
-        let (dx, ds, db) = with_values(x, |x| {
-            with_values(&dy, |dy| {
-                let mut dx = vec![0.0; x.len()];
-                let vectors = n.div_ceil(LANES);
-                let (mut ds, mut db) = (vec![f32x16::ZERO; vectors], vec![f32x16::ZERO; vectors]);
-                for ((row, dy), dx) in x.chunks_exact(n).zip(dy.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
-                    let (mean, inverse) = moments(row);
-                    let spread = f32x16::splat(inverse);
-                    let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
-                    for v in 0..vectors {
-                        let (from, to) = (v * LANES, n.min((v + 1) * LANES));
-                        let normal = centred(&row[from..to], mean) * spread;
-                        let d = load(&dy[from..to]);
-                        let g = d * load(&gains[from..to]);
-                        a += g;
-                        b = g.mul_add(normal, b);
-                        ds[v] = d.mul_add(normal, ds[v]);
-                        db[v] += d;
-                    }
-                    let (a, b) = (f32x16::splat(sum(a) / n as f32), f32x16::splat(sum(b) / n as f32));
-                    for v in 0..vectors {
-                        let (from, to) = (v * LANES, n.min((v + 1) * LANES));
-                        let normal = centred(&row[from..to], mean) * spread;
-                        let g = load(&dy[from..to]) * load(&gains[from..to]);
-                        store(spread * (g - a - normal * b), &mut dx[from..to]);
-                    }
-                }
-                let flat = |data: Vec<f32x16>| data.iter().flat_map(|v| v.to_array()).take(n).collect::<Vec<f32>>();
-                (dx, flat(ds), flat(db))
-            })
-        })??;
-        let device = x.device();
-        Ok((
-            Some(Tensor::from_vec(dx, x.shape(), device)?),
-            Some(Tensor::from_vec(ds, n, device)?),
-            Some(Tensor::from_vec(db, n, device)?),
-        ))
+    fn backward(&self, [x, gains, _]: [Arg<'_>; 3], _y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
+        let (x, gains, n) = (x.values, gains.values, gains.values.len());
+        let mut dx = vec![0.0; x.len()];
+        let vectors = n.div_ceil(LANES);
+        let (mut ds, mut db) = (vec![f32x16::ZERO; vectors], vec![f32x16::ZERO; vectors]);
+        for ((row, dy), dx) in x.chunks_exact(n).zip(dy.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
+            let (mean, inverse) = moments(row);
+            let spread = f32x16::splat(inverse);
+            let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
+            for v in 0..vectors {
+                let (from, to) = (v * LANES, n.min((v + 1) * LANES));
+                let normal = centred(&row[from..to], mean) * spread;
+                let d = load(&dy[from..to]);
+                let g = d * load(&gains[from..to]);
+                a += g;
+                b = g.mul_add(normal, b);
+                ds[v] = d.mul_add(normal, ds[v]);
+                db[v] += d;
+            }
+            let (a, b) = (f32x16::splat(sum(a) / n as f32), f32x16::splat(sum(b) / n as f32));
+            for v in 0..vectors {
+                let (from, to) = (v * LANES, n.min((v + 1) * LANES));
+                let normal = centred(&row[from..to], mean) * spread;
+                let g = load(&dy[from..to]) * load(&gains[from..to]);
+                store(spread * (g - a - normal * b), &mut dx[from..to]);
+            }
+        }
+        let flat = |data: Vec<f32x16>| data.iter().flat_map(|v| v.to_array()).take(n).collect();
+        Ok([Some(dx), Some(flat(ds)), Some(flat(db))])
     }
 }

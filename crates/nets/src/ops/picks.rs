@@ -1,6 +1,6 @@
+use super::operation::{Arg, Operation, apply1};
 use super::simd::{LANES, load, store, sum};
-use super::{slice, with_values};
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::Arc;
 use wide::f32x16;
 
@@ -24,11 +24,10 @@ pub struct PickTable {
     pub picks: Vec<Pick>,
 }
 
-/// Sequential masked softmax: for every pick the log-probability of its column among the columns still free, and the
-/// entropy of that choice. `scores` is flat; the result [2, P] stacks log-probabilities and entropies of all picks of all
-/// instances. With one row for all picks this is the Plackett–Luce likelihood of a ranking.
+/// Sequential masked softmax: [2, P] log-probability of every pick's column among those still free, and entropy of that
+/// choice, from flat `scores`. With one row for all picks this is the Plackett–Luce likelihood of a ranking.
 pub fn pick_log_probs(scores: &Tensor, tables: Arc<Vec<PickTable>>) -> Result<Tensor> {
-    scores.flatten_all()?.contiguous()?.apply_op1(PickLogProbs { tables })
+    apply1(PickLogProbs { tables }, &scores.flatten_all()?)
 }
 
 struct PickLogProbs {
@@ -45,7 +44,6 @@ pub(crate) type Mask = [f32];
 /// maximum the sum could underflow late in a ranking.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct MaskedSoftmax {
-    /// Largest free score.
     pub(crate) max: f32,
     log_sum: f32,
 }
@@ -96,13 +94,11 @@ fn vectors<'a>(row: &'a [f32], mask: &'a Mask) -> impl Iterator<Item = (f32x16, 
     })
 }
 
-impl CustomOp1 for PickLogProbs {
-    fn name(&self) -> &'static str {
-        "pick-log-probs"
-    }
+impl Operation<1> for PickLogProbs {
+    const NAME: &'static str = "pick-log-probs";
 
-    fn cpu_fwd(&self, scores: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let scores = slice(scores, layout)?;
+    fn forward(&self, [scores]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
+        let scores = scores.values;
         let count: usize = self.tables.iter().map(|t| t.picks.len()).sum();
         let mut out = vec![0.0; 2 * count];
         let mut at = 0;
@@ -123,34 +119,30 @@ impl CustomOp1 for PickLogProbs {
                 at += 1;
             }
         }
-        Ok((CpuStorage::F32(out), Shape::from((2, count))))
+        Ok((out, Shape::from((2, count))))
     }
 
-    fn bwd(&self, scores: &Tensor, out: &Tensor, upstream: &Tensor) -> Result<Option<Tensor>> {
-        let (_, count) = out.dims2()?;
-        let upstream = upstream.contiguous()?.flatten_all()?.to_vec1::<f32>()?;
-        let gradient = with_values(scores, |scores| {
-            let mut gradient = vec![0.0; scores.len()];
-            let mut at = 0;
-            for table in self.tables.iter() {
-                let mut mask = vec![0.0; table.columns];
-                let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
-                for pick in &table.picks {
-                    let start = table.start + pick.row as usize * table.columns;
-                    let row = start..start + table.columns;
-                    let scores = &scores[row.clone()];
-                    let entropy = MaskedSoftmax::of(scores, &mask).fill(scores, &mask, &mut probs, &mut log_probs);
-                    let (d_log_prob, d_entropy) = (upstream[at], upstream[count + at]);
-                    for ((g, &p), &log_prob) in gradient[row].iter_mut().zip(&probs).zip(&log_probs) {
-                        *g -= p * (d_log_prob + d_entropy * (log_prob + entropy));
-                    }
-                    gradient[start + pick.column as usize] += d_log_prob;
-                    mask[pick.column as usize] = f32::NEG_INFINITY;
-                    at += 1;
+    fn backward(&self, [scores]: [Arg<'_>; 1], y: &[f32], upstream: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
+        let (scores, count) = (scores.values, y.len() / 2);
+        let mut gradient = vec![0.0; scores.len()];
+        let mut at = 0;
+        for table in self.tables.iter() {
+            let mut mask = vec![0.0; table.columns];
+            let (mut probs, mut log_probs) = (vec![0.0; table.columns], vec![0.0; table.columns]);
+            for pick in &table.picks {
+                let start = table.start + pick.row as usize * table.columns;
+                let row = start..start + table.columns;
+                let scores = &scores[row.clone()];
+                let entropy = MaskedSoftmax::of(scores, &mask).fill(scores, &mask, &mut probs, &mut log_probs);
+                let (d_log_prob, d_entropy) = (upstream[at], upstream[count + at]);
+                for ((g, &p), &log_prob) in gradient[row].iter_mut().zip(&probs).zip(&log_probs) {
+                    *g -= p * (d_log_prob + d_entropy * (log_prob + entropy));
                 }
+                gradient[start + pick.column as usize] += d_log_prob;
+                mask[pick.column as usize] = f32::NEG_INFINITY;
+                at += 1;
             }
-            gradient
-        })?;
-        Ok(Some(Tensor::from_vec(gradient, scores.shape(), scores.device())?))
+        }
+        Ok([Some(gradient)])
     }
 }

@@ -3,7 +3,6 @@
 
 use wide::f32x16;
 
-/// Lanes of a vector.
 pub(crate) const LANES: usize = 16;
 
 /// The first sixteen numbers; a shorter slice is filled up with zeros.

@@ -2,8 +2,8 @@
 
 use super::exact::{call, difference};
 use super::recording::{Mode, Physics, Trajectory};
-use super::{DroneReport, turned};
-use crate::check::{Check, worse};
+use super::turned;
+use crate::report::{Report, worse};
 use magex_core::task::Downwash;
 use magex_env::drones::control::Memory;
 use magex_env::drones::model::State;
@@ -38,39 +38,29 @@ fn world(recording: &Trajectory, t: usize) -> World {
 }
 
 /// Adds what rapier can and cannot follow.
-pub(super) fn verify(recording: &Trajectory, report: &mut DroneReport) {
+pub(super) fn verify(recording: &Trajectory, report: &mut Report) {
     let Physics::Bullet(effects) = recording.physics else { return };
     let mut laws = Laws::new(recording.craft, effects, Downwash::Reference, recording.dt);
     laws.always = true;
     one_step(recording, &laws, report);
     let followed = recording.horizon.min((SECONDS * recording.physics_hz) as usize);
+    let [position, velocity, attitude] = run(recording, &laws, followed);
     if recording.mode == Mode::Rpm {
-        let [position, _, attitude] = run(recording, &laws, followed);
-        report.checks.push(Check {
-            what: "rapier open loop, m",
-            worst: position,
-            limit: None,
-            words: format!("nothing corrects roundings of f32; attitude {attitude:.1e} degrees"),
-        });
+        let words = format!("nothing corrects roundings of f32; attitude {attitude:.1e} degrees");
+        report.informative("rapier open loop, m", position, words);
     } else if recording.chaotic || recording.control_hz < LEAST_CONTROL_HZ {
-        let [position, ..] = run(recording, &laws, followed);
-        report.checks.push(Check {
-            what: "rapier closed loop, m",
-            worst: position,
-            limit: None,
-            words: format!("over {followed} steps; a controller below 120 Hz amplifies roundings of f32"),
-        });
+        let words = format!("over {followed} steps; a controller below 120 Hz amplifies roundings of f32");
+        report.informative("rapier closed loop, m", position, words);
     } else {
-        let [position, velocity, attitude] = run(recording, &laws, followed);
         let bound = if recording.speed_limit >= FAST || effects.drag { POSITION_FAST } else { POSITION };
-        report.checks.push(Check::limited("rapier closed loop, m", position, bound));
-        report.checks.push(Check::limited("rapier closed loop, m/s", velocity, VELOCITY));
-        report.checks.push(Check::limited("rapier closed loop, degrees", attitude, ATTITUDE));
+        report.limited("rapier closed loop, m", position, bound);
+        report.limited("rapier closed loop, m/s", velocity, VELOCITY);
+        report.limited("rapier closed loop, degrees", attitude, ATTITUDE);
     }
 }
 
 /// One step of rapier from every recorded state.
-fn one_step(recording: &Trajectory, laws: &Laws, report: &mut DroneReport) {
+fn one_step(recording: &Trajectory, laws: &Laws, report: &mut Report) {
     let (mut motion, mut attitude, mut fast, mut fastest, mut beyond) = (0.0, 0.0, 0.0, 0.0f64, 0.0f64);
     for t in 0..recording.steps() {
         let mut world = world(recording, t);
@@ -90,19 +80,14 @@ fn one_step(recording: &Trajectory, laws: &Laws, report: &mut DroneReport) {
             }
         }
     }
-    report.checks.push(Check::limited("rapier one step, motion", motion, ONE_STEP));
-    report.checks.push(Check::limited("rapier one step, attitude", attitude, ONE_STEP));
+    report.limited("rapier one step, motion", motion, ONE_STEP);
+    report.limited("rapier one step, attitude", attitude, ONE_STEP);
     if fastest > 0.0 {
-        report.checks.push(Check::limited("rapier one step, fast turn over what it may miss", beyond, 1.0));
-        report.checks.push(Check {
-            what: "rapier one step, fast turn",
-            worst: fast,
-            limit: None,
-            words: format!(
-                "rapier linearises rotations: a turn of {fastest:.3} rad in a step is short by {:.1e}",
-                fastest.powi(3) / 12.0
-            ),
-        });
+        report.limited("rapier one step, fast turn over what it may miss", beyond, 1.0);
+        let short = fastest.powi(3) / 12.0;
+        let words =
+            format!("rapier linearises rotations: a turn of {fastest:.3} rad in a step is short by {short:.1e}");
+        report.informative("rapier one step, fast turn", fast, words);
     }
 }
 
@@ -132,7 +117,6 @@ fn run(recording: &Trajectory, laws: &Laws, steps: usize) -> [f64; 3] {
     worst
 }
 
-/// Angle between two attitudes, degrees.
 fn angle(a: [f64; 4], b: [f64; 4]) -> f64 {
     let [x, y, z, w] = magex_env::drones::linalg::product(a, [-b[0], -b[1], -b[2], b[3]]);
     2.0 * libm::atan2(libm::sqrt(x * x + y * y + z * z), w.abs()).to_degrees()

@@ -1,8 +1,8 @@
 //! The reference model and the controller against a recorded flight.
 
 use super::recording::{Mode, Physics, Trajectory};
-use super::{DroneReport, apart, turned};
-use crate::check::{Check, worse};
+use super::{FREE_RUN, ONE_STEP, RELATIVE, apart, turned};
+use crate::report::{Report, worse};
 use magex_env::drones::control::{Answer, Memory, Request};
 use magex_env::drones::model::{Inputs, State};
 
@@ -16,7 +16,6 @@ struct Flight {
 }
 
 impl Flight {
-    /// The recorded state before step `t`.
     fn at(recording: &Trajectory, t: usize) -> Self {
         let drones = 0..recording.drones;
         Self {
@@ -34,7 +33,8 @@ impl Flight {
                 Physics::Bullet(effects) => {
                     let wash = if effects.downwash { wash(recording, &before, i) } else { 0.0 };
                     let inputs = Inputs { lagged: self.lagged[i], rpm: rpm[i], rpm_before: self.rpm_before[i], wash };
-                    recording.craft.step(&state, &inputs, effects, recording.dt)
+                    let loads = recording.craft.loads(&state, &inputs, effects);
+                    recording.craft.integrate(&state, &loads, recording.dt)
                 }
                 Physics::Explicit => {
                     let (next, rates) = recording.craft.step_explicit(&state, self.rates[i], rpm[i], recording.dt);
@@ -69,7 +69,7 @@ pub(super) fn difference(ours: &State, recorded: &State) -> f64 {
 }
 
 /// Sum of the downwash of all drones above drone `i`, in their order.
-pub(super) fn wash(recording: &Trajectory, states: &[State], i: usize) -> f64 {
+fn wash(recording: &Trajectory, states: &[State], i: usize) -> f64 {
     let here = states[i].position;
     let mut sum = 0.0;
     for (j, other) in states.iter().enumerate() {
@@ -82,19 +82,15 @@ pub(super) fn wash(recording: &Trajectory, states: &[State], i: usize) -> f64 {
 }
 
 /// What drone `i` is asked for in control period `k`, seen from a state.
-pub(super) fn request(recording: &Trajectory, k: usize, i: usize, state: &State) -> Request {
-    let command = recording.control[k].command[i];
-    let [a, b, c, last] = command;
+fn request(recording: &Trajectory, k: usize, i: usize, state: &State) -> Request {
+    let [a, b, c, last] = recording.control[k].command[i];
     if recording.mode == Mode::Velocity {
         let length = libm::sqrt(a * a + b * b + c * c);
         let speed = if length == 0.0 { 0.0 } else { recording.speed_limit * last.abs() / length };
-        let target = [speed * a, speed * b, speed * c];
-        Request::velocity(state.position, state.attitude, state.velocity, target)
+        Request::velocity(*state, [speed * a, speed * b, speed * c])
     } else {
         Request {
-            position: state.position,
-            attitude: state.attitude,
-            velocity: state.velocity,
+            state: *state,
             target_position: [a, b, c],
             target_velocity: [0.0; 3],
             target_yaw: Some(last),
@@ -112,11 +108,6 @@ pub(super) fn intrinsic(target: &[[f64; 3]; 3]) -> [f64; 3] {
     ]
 }
 
-/// Largest relative difference of an rpm.
-pub(super) fn rpm_apart(ours: [f64; 4], recorded: [f64; 4]) -> f64 {
-    ours.iter().zip(recorded).fold(0.0, |worst, (a, b)| worse(worst, (a - b).abs() / b.abs().max(1.0)))
-}
-
 /// Largest difference of angles, whole turns apart being equal.
 pub(super) fn angles_apart(ours: [f64; 3], recorded: [f64; 3]) -> f64 {
     ours.iter().zip(recorded).fold(0.0, |worst, (a, b)| {
@@ -126,36 +117,29 @@ pub(super) fn angles_apart(ours: [f64; 3], recorded: [f64; 3]) -> f64 {
 }
 
 /// Measures the model and, in closed loop, the controller.
-pub(super) fn verify(recording: &Trajectory) -> DroneReport {
+pub(super) fn verify(recording: &Trajectory) -> Report {
     let mode = match recording.mode {
         Mode::Rpm => "open loop".to_owned(),
         Mode::Velocity => format!("velocity at {} Hz, up to {} m/s", recording.control_hz, recording.speed_limit),
         Mode::Position => format!("position at {} Hz", recording.control_hz),
     };
-    let mut report = DroneReport {
-        content: format!(
-            "{}, {mode}, N = {}, {} steps at {} Hz{}",
-            recording.physics_name,
-            recording.drones,
-            recording.steps(),
-            recording.physics_hz,
-            if recording.chaotic { ", chaotic" } else { "" }
-        ),
-        checks: vec![
-            Check::limited("one step", one_step(recording), DroneReport::ONE_STEP),
-            Check::limited("free run", free_run(recording), DroneReport::FREE_RUN),
-        ],
-    };
+    let (drones, steps, hz) = (recording.drones, recording.steps(), recording.physics_hz);
+    let chaotic = if recording.chaotic { ", chaotic" } else { "" };
+    let content = format!("{}, {mode}, N = {drones}, {steps} steps at {hz} Hz{chaotic}", recording.physics_name);
+    let mut report = Report { content, ..Report::default() };
+    report.limited("one step", one_step(recording), ONE_STEP);
+    report.limited("free run", free_run(recording), FREE_RUN);
     if recording.mode != Mode::Rpm {
         let (rpm, trace) = controller(recording);
-        report.checks.push(Check::limited("controller rpm", rpm, DroneReport::RELATIVE));
-        report.checks.push(Check::limited("controller target", trace, DroneReport::RELATIVE));
-        let mut closed = Check::limited("closed loop", closed_loop(recording), DroneReport::FREE_RUN);
+        report.limited("controller rpm", rpm, RELATIVE);
+        report.limited("controller target", trace, RELATIVE);
+        let closed = closed_loop(recording);
         if recording.chaotic {
-            closed.limit = None;
-            closed.words = "chaotic: a difference of 1e-12 has grown to 1e-9 at the horizon".into();
+            let words = "chaotic: a difference of 1e-12 has grown to 1e-9 at the horizon";
+            report.informative("closed loop", closed, words);
+        } else {
+            report.limited("closed loop", closed, FREE_RUN);
         }
-        report.checks.push(closed);
     }
     report
 }
@@ -185,7 +169,7 @@ fn controller(recording: &Trajectory) -> (f64, f64) {
         let t = k * recording.hold;
         for (i, memory) in memories.iter_mut().enumerate() {
             let answer = call(recording, memory, k, i, &recording.frames[t][i]);
-            rpm = worse(rpm, rpm_apart(answer.rpm, recording.rpm[t][i]));
+            rpm = worse(rpm, apart(&answer.rpm, &recording.rpm[t][i]));
             trace = worse(trace, apart(&[answer.thrust_pwm], &[recorded.thrust_pwm[i]]));
             trace = worse(trace, angles_apart(intrinsic(&answer.target), recorded.target_euler[i]));
         }

@@ -1,10 +1,10 @@
 //! The forces of the effects against recorded ones.
 
-use super::DroneReport;
-use super::recording::{array, craft, quaternion};
-use crate::check::{Check, worse};
-use crate::error::RecordingError;
+use super::RELATIVE;
+use super::recording::{craft, quaternion};
 use crate::reader::Field;
+use crate::report::{Report, worse};
+use magex_core::error::FieldError;
 use magex_env::drones::linalg::{Mat3, norm, sub};
 
 /// Most samples.
@@ -20,7 +20,8 @@ fn relative_vector(ours: [f64; 3], recorded: [f64; 3]) -> f64 {
     norm(sub(ours, recorded)) / norm(recorded).max(TINY)
 }
 
-pub(super) fn verify(root: &Field<'_>) -> Result<DroneReport, RecordingError> {
+/// Recomputes thrust, ground effect, drag and downwash of every sample.
+pub(crate) fn verify(root: &Field<'_>) -> Result<Report, FieldError> {
     let craft = craft(root)?;
     let (mut thrust, mut ground, mut drag, mut downwash) = (0.0, 0.0, 0.0, 0.0);
     let mut samples = 0;
@@ -29,22 +30,23 @@ pub(super) fn verify(root: &Field<'_>) -> Result<DroneReport, RecordingError> {
         let recorded = sample.get("drones")?;
         let drones: Vec<_> = recorded.items(1000)?.collect();
         let n = drones.len();
-        let positions: Vec<[f64; 3]> = sample.get("pos")?.each(n, array)?;
+        let positions: Vec<[f64; 3]> = sample.get("pos")?.each(n, Field::array)?;
         let attitudes = sample.get("quat")?.each(n, quaternion)?;
-        let velocities: Vec<[f64; 3]> = sample.get("vel")?.each(n, array)?;
-        let rpm: Vec<[f64; 4]> = sample.get("rpm")?.each(n, array)?;
-        let rpm_before: Vec<[f64; 4]> = sample.get("rpm_prev")?.each(n, array)?;
+        let velocities: Vec<[f64; 3]> = sample.get("vel")?.each(n, Field::array)?;
+        let rpm: Vec<[f64; 4]> = sample.get("rpm")?.each(n, Field::array)?;
+        let rpm_before: Vec<[f64; 4]> = sample.get("rpm_prev")?.each(n, Field::array)?;
         for (i, recorded) in drones.iter().enumerate() {
-            for (ours, theirs) in craft.thrust(rpm[i]).into_iter().zip(array::<4>(&recorded.get("thrust_N")?)?) {
+            for (ours, theirs) in craft.thrust(rpm[i]).into_iter().zip(recorded.get("thrust_N")?.array::<4>()?) {
                 thrust = worse(thrust, relative(ours, theirs));
             }
             let moment = recorded.get("yaw_torque_Nm")?.number()?;
             thrust = worse(thrust, relative(craft.yaw_moment(rpm[i]), moment));
             let field = recorded.get("gnd_N")?;
-            match (craft.ground_effect(positions[i], attitudes[i], rpm[i]), field.is_null()) {
+            let (r, thrusts) = (Mat3::of(attitudes[i]), craft.thrust(rpm[i]));
+            match (craft.ground_effect(positions[i], attitudes[i], &r, thrusts), field.is_null()) {
                 (None, true) => {}
                 (Some(ours), false) => {
-                    for (ours, theirs) in ours.into_iter().zip(array::<4>(&field)?) {
+                    for (ours, theirs) in ours.into_iter().zip(field.array::<4>()?) {
                         ground = worse(ground, relative(ours, theirs));
                     }
                 }
@@ -52,9 +54,9 @@ pub(super) fn verify(root: &Field<'_>) -> Result<DroneReport, RecordingError> {
                 _ => ground = worse(ground, f64::INFINITY),
             }
             let world = craft.drag(velocities[i], rpm_before[i]);
-            drag = worse(drag, relative_vector(world, array(&recorded.get("drag_world_N")?)?));
-            let body = Mat3::of(attitudes[i]).back(world);
-            drag = worse(drag, relative_vector(body, array(&recorded.get("drag_body_N")?)?));
+            drag = worse(drag, relative_vector(world, recorded.get("drag_world_N")?.array()?));
+            let body = r.back(world);
+            drag = worse(drag, relative_vector(body, recorded.get("drag_body_N")?.array()?));
             let here = positions[i];
             let others = (0..n)
                 .filter(|&j| j != i)
@@ -70,13 +72,10 @@ pub(super) fn verify(root: &Field<'_>) -> Result<DroneReport, RecordingError> {
     if samples == 0 {
         return Err(root.get("samples")?.wrong("holds no sample"));
     }
-    Ok(DroneReport {
-        content: format!("{samples} samples"),
-        checks: vec![
-            Check::limited("thrust", thrust, DroneReport::RELATIVE),
-            Check::limited("ground effect", ground, DroneReport::RELATIVE),
-            Check::limited("drag", drag, DroneReport::RELATIVE),
-            Check::limited("downwash", downwash, DroneReport::RELATIVE),
-        ],
-    })
+    let mut report = Report { content: format!("{samples} samples"), ..Report::default() };
+    report.limited("thrust", thrust, RELATIVE);
+    report.limited("ground effect", ground, RELATIVE);
+    report.limited("drag", drag, RELATIVE);
+    report.limited("downwash", downwash, RELATIVE);
+    Ok(report)
 }

@@ -1,7 +1,7 @@
 //! A recorded flight as data.
 
-use crate::error::RecordingError;
 use crate::reader::Field;
+use magex_core::error::FieldError;
 use magex_env::drones::control::Gains;
 use magex_env::drones::model::{Craft, Effects, State};
 
@@ -15,20 +15,15 @@ const UNIT: f64 = 1e-3;
 /// What moved the drones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Physics {
-    /// Bullet's integration with these effects.
     Bullet(Effects),
-    /// The explicit model.
     Explicit,
 }
 
 /// What commanded the motors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Mode {
-    /// The recording's own rpm.
     Rpm,
-    /// Tracking of a velocity.
     Velocity,
-    /// Tracking of a position and a yaw.
     Position,
 }
 
@@ -37,7 +32,6 @@ pub(super) enum Mode {
 pub(super) struct Trace {
     /// Velocity: direction and fraction of the speed limit; position: x, y, z, yaw.
     pub(super) command: Vec<[f64; 4]>,
-    /// Collective PWM.
     pub(super) thrust_pwm: Vec<f64>,
     /// Intrinsic X-Y-Z angles of the target attitude.
     pub(super) target_euler: Vec<[f64; 3]>,
@@ -46,19 +40,12 @@ pub(super) struct Trace {
 /// A recorded flight.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Trajectory {
-    /// Constants of the drone.
     pub(super) craft: Craft,
-    /// Gains of the controller.
     pub(super) gains: Gains,
-    /// The name of the physics, as the file says it.
     pub(super) physics_name: String,
-    /// The physics.
     pub(super) physics: Physics,
-    /// The mode.
     pub(super) mode: Mode,
-    /// Physics steps per second.
     pub(super) physics_hz: f64,
-    /// Control periods per second.
     pub(super) control_hz: f64,
     /// Seconds per physics step.
     pub(super) dt: f64,
@@ -80,22 +67,11 @@ pub(super) struct Trajectory {
     pub(super) control: Vec<Trace>,
     /// Whether a perturbation grows too fast for free runs to be compared to the end.
     pub(super) chaotic: bool,
-    /// Steps of the free run.
     pub(super) horizon: usize,
 }
 
-/// An array of known length.
-pub(super) fn array<const N: usize>(field: &Field<'_>) -> Result<[f64; N], RecordingError> {
-    let mut out = [0.0; N];
-    for (slot, field) in out.iter_mut().zip(field.list(N)?) {
-        *slot = field.number()?;
-    }
-    Ok(out)
-}
-
-/// A unit quaternion.
-pub(super) fn quaternion(field: &Field<'_>) -> Result<[f64; 4], RecordingError> {
-    let q = array::<4>(field)?;
+pub(super) fn quaternion(field: &Field<'_>) -> Result<[f64; 4], FieldError> {
+    let q = field.array::<4>()?;
     let length = libm::sqrt(q.iter().map(|c| c * c).sum());
     if (length - 1.0).abs() > UNIT {
         return Err(field.wrong(format!("a quaternion of length {length}; must be 1")));
@@ -103,33 +79,21 @@ pub(super) fn quaternion(field: &Field<'_>) -> Result<[f64; 4], RecordingError> 
     Ok(q)
 }
 
-fn positives<const N: usize>(field: &Field<'_>) -> Result<[f64; N], RecordingError> {
-    let mut out = [0.0; N];
-    for (slot, field) in out.iter_mut().zip(field.list(N)?) {
-        *slot = field.positive()?;
-    }
-    Ok(out)
-}
-
 /// The drone of `meta.constants`.
-pub(super) fn craft(root: &Field<'_>) -> Result<Craft, RecordingError> {
+pub(super) fn craft(root: &Field<'_>) -> Result<Craft, FieldError> {
     let c = root.get("meta")?.get("constants")?;
     let number = |name: &str| c.get(name)?.number();
     let positive = |name: &str| c.get(name)?.positive();
-    let mut propellers = [[0.0; 3]; 4];
-    for (slot, field) in propellers.iter_mut().zip(c.get("prop_positions_m")?.list(4)?) {
-        *slot = array(&field)?;
-    }
     let along = number("drag_coeff_xy")?;
     Ok(Craft {
         mass: positive("mass_kg")?,
         gravity: number("gravity_m_s2")?,
-        inertia: positives(&c.get("inertia_diag_kg_m2")?)?,
+        inertia: c.get("inertia_diag_kg_m2")?.fixed(Field::positive)?,
         arm: number("arm_m")?,
-        propellers,
+        propellers: c.get("prop_positions_m")?.fixed(Field::array)?,
         kf: positive("kf_N_per_rpm2")?,
         km: number("km_Nm_per_rpm2")?,
-        yaw_signs: array(&c.get("yaw_sign_per_motor")?)?,
+        yaw_signs: c.get("yaw_sign_per_motor")?.array()?,
         propeller_radius: positive("prop_radius_m")?,
         ground: positive("gnd_eff_coeff")?,
         drag: [along, along, number("drag_coeff_z")?],
@@ -141,13 +105,9 @@ pub(super) fn craft(root: &Field<'_>) -> Result<Craft, RecordingError> {
 }
 
 /// The controller of `meta.constants.pid`.
-pub(super) fn gains(root: &Field<'_>) -> Result<Gains, RecordingError> {
+pub(super) fn gains(root: &Field<'_>) -> Result<Gains, FieldError> {
     let pid = root.get("meta")?.get("constants")?.get("pid")?;
-    let vector = |name: &str| array::<3>(&pid.get(name)?);
-    let mut mixer = [[0.0; 3]; 4];
-    for (slot, field) in mixer.iter_mut().zip(pid.get("mixer")?.list(4)?) {
-        *slot = array(&field)?;
-    }
+    let vector = |name: &str| pid.get(name)?.array();
     let most = pid.get("pwm_max")?;
     let (least_pwm, most_pwm) = (pid.get("pwm_min")?.number()?, most.number()?);
     if least_pwm > most_pwm {
@@ -160,20 +120,20 @@ pub(super) fn gains(root: &Field<'_>) -> Result<Gains, RecordingError> {
         p_torque: vector("P_tor")?,
         i_torque: vector("I_tor")?,
         d_torque: vector("D_tor")?,
-        most_position_integral: positives(&pid.get("integral_pos_clip")?)?,
-        most_attitude_integral: positives(&pid.get("integral_rpy_clip")?)?,
+        most_position_integral: pid.get("integral_pos_clip")?.fixed(Field::positive)?,
+        most_attitude_integral: pid.get("integral_rpy_clip")?.fixed(Field::positive)?,
         most_torque: pid.get("torque_clip")?.positive()?,
         rpm_per_pwm: pid.get("pwm2rpm_scale")?.positive()?,
         rpm_at_zero: pid.get("pwm2rpm_const")?.number()?,
         least_pwm,
         most_pwm,
-        mixer,
+        mixer: pid.get("mixer")?.fixed(Field::array)?,
     })
 }
 
 impl Trajectory {
     /// Reads the format `drone-golden-1`. Every error names its field.
-    pub(super) fn read(root: &Field<'_>) -> Result<Self, RecordingError> {
+    pub(super) fn read(root: &Field<'_>) -> Result<Self, FieldError> {
         let name = root.get("physics")?;
         let physics = physics(&name)?;
         let mode = root.get("mode")?;
@@ -183,11 +143,11 @@ impl Trajectory {
             "position" => Mode::Position,
             other => return Err(mode.wrong(format!("'{other}' is unknown; use rpm, velocity or position"))),
         };
-        let drones = at_least_one(&root.get("n_drones")?, MOST_DRONES)?;
-        let steps = at_least_one(&root.get("T")?, MOST)?;
-        let periods = at_least_one(&root.get("K")?, MOST)?;
+        let drones = root.get("n_drones")?.count(MOST_DRONES)?;
+        let steps = root.get("T")?.count(MOST)?;
+        let periods = root.get("K")?.count(MOST)?;
         let hold_field = root.get("steps_per_ctrl")?;
-        let hold = at_least_one(&hold_field, MOST)?;
+        let hold = hold_field.count(MOST)?;
         if periods.checked_mul(hold) != Some(steps) {
             return Err(hold_field.wrong(format!("{hold} times K = {periods} is not T = {steps}")));
         }
@@ -220,22 +180,18 @@ impl Trajectory {
             drones,
             speed_limit,
             frames: frames(root, drones, steps)?,
-            rates: rates(root, physics, drones, steps)?,
-            rpm: root.get("rpm")?.each(steps, |step| step.each(drones, array))?,
+            rates: match physics {
+                Physics::Explicit => root.series("body_rates", steps, |step| step.each(drones, Field::array))?,
+                Physics::Bullet(_) => Vec::new(),
+            },
+            rpm: root.get("rpm")?.each(steps, |step| step.each(drones, Field::array))?,
             control: if mode == Mode::Rpm { Vec::new() } else { traces(root, drones, periods)? },
             chaotic: root.get("chaotic")?.flag()?,
-            horizon: match root.get("free_run_horizon_steps")?.index(MOST)?.min(steps) {
-                0 => {
-                    return Err(root
-                        .get("free_run_horizon_steps")?
-                        .wrong("must be at least 1, or nothing would be compared"));
-                }
-                horizon => horizon,
-            },
+            // Of none, nothing would be compared.
+            horizon: root.get("free_run_horizon_steps")?.count(MOST)?.min(steps),
         })
     }
 
-    /// T.
     pub(super) fn steps(&self) -> usize {
         self.rpm.len()
     }
@@ -245,13 +201,12 @@ impl Trajectory {
         self.frames[t.saturating_sub(1)][drone].attitude
     }
 
-    /// The rpm before step `t`.
     pub(super) fn rpm_before(&self, t: usize, drone: usize) -> [f64; 4] {
         if t == 0 { [0.0; 4] } else { self.rpm[t - 1][drone] }
     }
 }
 
-fn physics(field: &Field<'_>) -> Result<Physics, RecordingError> {
+fn physics(field: &Field<'_>) -> Result<Physics, FieldError> {
     let none = Effects::default();
     Ok(match field.text()? {
         "PYB" => Physics::Bullet(none),
@@ -267,22 +222,10 @@ fn physics(field: &Field<'_>) -> Result<Physics, RecordingError> {
     })
 }
 
-fn at_least_one(field: &Field<'_>, bound: usize) -> Result<usize, RecordingError> {
-    match field.index(bound)? {
-        0 => Err(field.wrong("must be at least 1")),
-        n => Ok(n),
-    }
-}
-
-fn frames(root: &Field<'_>, drones: usize, steps: usize) -> Result<Vec<Vec<State>>, RecordingError> {
-    let vectors = |name: &str| -> Result<Vec<Vec<[f64; 3]>>, RecordingError> {
-        let mut all = vec![root.get(&format!("init_{name}"))?.each(drones, array)?];
-        all.extend(root.get(name)?.each(steps, |step| step.each(drones, array))?);
-        Ok(all)
-    };
-    let mut attitudes = vec![root.get("init_quat")?.each(drones, quaternion)?];
-    attitudes.extend(root.get("quat")?.each(steps, |step| step.each(drones, quaternion))?);
+fn frames(root: &Field<'_>, drones: usize, steps: usize) -> Result<Vec<Vec<State>>, FieldError> {
+    let vectors = |name: &str| root.series(name, steps, |step| step.each(drones, Field::array));
     let (positions, velocities, spins) = (vectors("pos")?, vectors("vel")?, vectors("ang_vel")?);
+    let attitudes = root.series("quat", steps, |step| step.each(drones, quaternion))?;
     let state = |t: usize, i: usize| State {
         position: positions[t][i],
         attitude: attitudes[t][i],
@@ -292,24 +235,10 @@ fn frames(root: &Field<'_>, drones: usize, steps: usize) -> Result<Vec<Vec<State
     Ok((0..=steps).map(|t| (0..drones).map(|i| state(t, i)).collect()).collect())
 }
 
-fn rates(
-    root: &Field<'_>,
-    physics: Physics,
-    drones: usize,
-    steps: usize,
-) -> Result<Vec<Vec<[f64; 3]>>, RecordingError> {
-    if physics != Physics::Explicit {
-        return Ok(Vec::new());
-    }
-    let mut all = vec![root.get("init_body_rates")?.each(drones, array)?];
-    all.extend(root.get("body_rates")?.each(steps, |step| step.each(drones, array))?);
-    Ok(all)
-}
-
-fn traces(root: &Field<'_>, drones: usize, periods: usize) -> Result<Vec<Trace>, RecordingError> {
-    let commands = root.get("command")?.each(periods, |period| period.each(drones, array))?;
+fn traces(root: &Field<'_>, drones: usize, periods: usize) -> Result<Vec<Trace>, FieldError> {
+    let commands = root.get("command")?.each(periods, |period| period.each(drones, Field::array))?;
     let pwm = root.get("ctrl_thrust_pwm")?.each(periods, |period| period.each(drones, Field::number))?;
-    let euler = root.get("ctrl_target_euler")?.each(periods, |period| period.each(drones, array))?;
+    let euler = root.get("ctrl_target_euler")?.each(periods, |period| period.each(drones, Field::array))?;
     let all = commands.into_iter().zip(pwm).zip(euler);
     Ok(all.map(|((command, thrust_pwm), target_euler)| Trace { command, thrust_pwm, target_euler }).collect())
 }

@@ -1,7 +1,7 @@
 //! A recording as data.
 
-use crate::error::RecordingError;
 use crate::reader::Field;
+use magex_core::error::FieldError;
 
 /// Most bodies and steps a recording may have: far beyond any, small enough that sizes cannot overflow.
 const MOST: usize = 1_000_000;
@@ -19,6 +19,13 @@ pub(super) struct Body {
     pub movable: bool,
     /// Whether it takes part in contacts.
     pub collide: bool,
+}
+
+impl Body {
+    /// A body of mass 1 that moves and collides.
+    pub(super) fn standard(size: f64) -> Self {
+        Self { size, mass: 1.0, movable: true, collide: true }
+    }
 }
 
 /// The bodies' state after a step, and what the authors' code said about it.
@@ -39,14 +46,12 @@ pub(super) struct Frame {
 /// Which task was recorded, and what only its recordings have.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Scenario {
-    /// Simple Spread.
     Spread {
         /// `[N]` landmark of each agent.
         goals: Vec<usize>,
         /// Unit of the distances in the reward.
         distance_unit: f64,
     },
-    /// Push Ball.
     PushBall {
         /// `[N]` ball and landmark of each agent.
         goals: Vec<[usize; 2]>,
@@ -56,8 +61,6 @@ pub(super) enum Scenario {
 /// One recorded episode.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Recording {
-    /// Its name.
-    pub name: String,
     /// Seconds per step.
     pub dt: f64,
     /// Share of the velocity lost per step.
@@ -68,8 +71,6 @@ pub(super) struct Recording {
     pub contact_margin: f64,
     /// Force of an action.
     pub sensitivity: f64,
-    /// Direction of each action.
-    pub directions: [[f64; 2]; 5],
     /// N.
     pub agents: usize,
     /// `[N + balls]` everything that forces act on: agents, then balls.
@@ -88,42 +89,35 @@ pub(super) struct Recording {
 
 impl Recording {
     /// Reads the format `mpe-golden-1`. Every error names its field.
-    pub(super) fn parse(text: &str) -> Result<Self, RecordingError> {
-        let value: serde_json::Value = serde_json::from_str(text)?;
-        let root = Field::root(&value);
-        let format = root.get("format")?.text()?;
-        if format != super::FORMAT {
-            return Err(RecordingError::Format { found: format.to_owned(), expected: super::FORMAT });
-        }
-        let scenario = root.get("scenario")?.text()?;
-        let pushing = match scenario {
-            "spread" => false,
-            "push_ball" => true,
-            _ => return Err(RecordingError::UnsupportedScenario { found: scenario.to_owned() }),
-        };
-        let n = root.get("n_agents")?.index(MOST_AGENTS)?;
-        let g = root.get("n_landmarks")?.index(MOST)?;
+    pub(super) fn read(root: &Field<'_>) -> Result<Self, FieldError> {
+        root.get("name")?.text()?;
+        let pushing = root.get("scenario")?.text()? == "push_ball";
+        let n = root.get("n_agents")?.count(MOST_AGENTS)?;
+        let g = root.get("n_landmarks")?.count(MOST)?;
         let steps = root.get("T")?.index(MOST)?;
-        let balls = root.get("n_balls")?.index(if pushing { MOST_AGENTS } else { 1 })?;
-        for (count, name) in [(n, "n_agents"), (g, "n_landmarks"), (balls, "n_balls")] {
-            if count == 0 && (pushing || name != "n_balls") {
-                return Err(root.get(name)?.wrong("must be at least 1"));
-            }
-        }
+        let balls = root.get("n_balls")?;
+        let balls = if pushing { balls.count(MOST_AGENTS)? } else { balls.index(1)? };
         let mut bodies = Self::bodies(&root.get("entities")?, [n, balls, g])?;
         let landmarks = bodies.split_off(n + balls);
         let meta = root.get("meta")?;
-        if meta.get("max_speed").is_ok_and(|speed| !speed.is_null()) {
-            return Err(meta.get("max_speed")?.wrong("is not supported; must be null"));
+        if let Some(speed) = meta.optional("max_speed")? {
+            return Err(speed.wrong("is not supported; must be null"));
+        }
+        let directions = meta.get("action_uxuy")?;
+        for (action, direction) in
+            [("0", [0.0, 0.0]), ("1", [1.0, 0.0]), ("2", [-1.0, 0.0]), ("3", [0.0, 1.0]), ("4", [0.0, -1.0])]
+        {
+            let field = directions.get(action)?;
+            if field.array()? != direction {
+                return Err(field.wrong(format!("must be {direction:?}")));
+            }
         }
         Ok(Self {
-            name: root.get("name")?.text()?.to_owned(),
             dt: meta.get("dt")?.positive()?,
             damping: meta.get("damping")?.number()?,
             contact_force: meta.get("contact_force")?.number()?,
             contact_margin: meta.get("contact_margin")?.positive()?,
             sensitivity: meta.get("action_sensitivity")?.number()?,
-            directions: Self::directions(&meta.get("action_uxuy")?)?,
             scenario: if pushing {
                 let ball = root.get("ball_of_agent")?.each(n, |ball| ball.index(balls))?;
                 let landmark = root.get("land_of_agent")?.each(n, |landmark| landmark.index(g))?;
@@ -136,21 +130,12 @@ impl Recording {
             bodies,
             landmarks,
             actions: root.get("actions")?.each(steps, |step| step.each(n, |a| Ok(a.index(5)? as u8)))?,
-            frames: Self::frames(&root, (n, n + balls + g), steps)?,
+            frames: Self::frames(root, (n, n + balls + g), steps)?,
             divergence: root.get("divergence_1e-12")?.each(steps, Field::number)?,
         })
     }
 
-    fn directions(field: &Field<'_>) -> Result<[[f64; 2]; 5], RecordingError> {
-        let mut directions = [[0.0; 2]; 5];
-        for (action, direction) in directions.iter_mut().enumerate() {
-            let pair = field.get(&action.to_string())?.each(2, Field::number)?;
-            *direction = [pair[0], pair[1]];
-        }
-        Ok(directions)
-    }
-
-    fn bodies<'a>(field: &Field<'a>, [n, balls, g]: [usize; 3]) -> Result<Vec<Body>, RecordingError> {
+    fn bodies<'a>(field: &Field<'a>, [n, balls, g]: [usize; 3]) -> Result<Vec<Body>, FieldError> {
         let read = |(k, body): (usize, Field<'a>)| {
             let expected = match k {
                 _ if k < n => "agent",
@@ -176,31 +161,20 @@ impl Recording {
         Ok(bodies.into_iter().map(|(body, _)| body).collect())
     }
 
-    fn frames(root: &Field<'_>, (n, all): (usize, usize), steps: usize) -> Result<Vec<Frame>, RecordingError> {
-        let points = |field: &Field<'_>| field.points(all);
-        let numbers = |field: &Field<'_>| field.each(n, Field::number);
-        let first = Frame {
-            positions: points(&root.get("init_pos")?)?,
-            velocities: points(&root.get("init_vel")?)?,
-            rewards: numbers(&root.get("init_reward_exe")?)?,
-            success_rate: root.get("init_success_rate")?.number()?,
-            overlaps: root.get("init_overlaps")?.index(usize::MAX)?,
+    fn frames(root: &Field<'_>, (n, all): (usize, usize), steps: usize) -> Result<Vec<Frame>, FieldError> {
+        let points = |field: &Field<'_>| field.each(all, Field::array);
+        let states = root.series("pos", steps, points)?.into_iter().zip(root.series("vel", steps, points)?);
+        let rewards = root.series("reward_exe", steps, |field| field.each(n, Field::number))?;
+        let success = root.series("success_rate", steps, Field::number)?;
+        let overlaps = root.series("overlaps", steps, |count| count.index(usize::MAX))?;
+        let scores = rewards.into_iter().zip(success).zip(overlaps);
+        let frame = |((positions, velocities), ((rewards, success_rate), overlaps))| Frame {
+            positions,
+            velocities,
+            rewards,
+            success_rate,
+            overlaps,
         };
-        let positions = root.get("pos")?.each(steps, points)?;
-        let velocities = root.get("vel")?.each(steps, points)?;
-        let rewards = root.get("reward_exe")?.each(steps, numbers)?;
-        let success = root.get("success_rate")?.each(steps, Field::number)?;
-        let overlaps = root.get("overlaps")?.each(steps, |count| count.index(usize::MAX))?;
-        let states = positions.into_iter().zip(velocities);
-        let rest = states.zip(rewards).zip(success.into_iter().zip(overlaps)).map(
-            |(((positions, velocities), rewards), (success_rate, overlaps))| Frame {
-                positions,
-                velocities,
-                rewards,
-                success_rate,
-                overlaps,
-            },
-        );
-        Ok(std::iter::once(first).chain(rest).collect())
+        Ok(states.zip(scores).map(frame).collect())
     }
 }

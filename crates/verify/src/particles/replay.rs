@@ -1,12 +1,18 @@
 //! Runs a recording's bodies through the kernels of the rollouts and compares.
 
-use super::MpeReport;
 use super::recording::{Body, Frame, Recording, Scenario};
-use crate::check::worse;
+use crate::report::{Report, worse};
 use magex_core::task::PushBallConfig;
-use magex_env::particles::physics::{AgentsAndBalls, Alike, Bodies, Forces, Motion, Pair, Pairs, Physics, find_pairs};
+use magex_env::particles::physics::{AgentsAndBalls, Alike, Bodies, Pair, Physics};
+use magex_env::particles::swarm::Swarm;
 use magex_env::{CONTACT_DISTANCE, Real};
 
+/// Largest one-step, reward and success difference of an agreeing f64 simulator.
+const ONE_STEP: f64 = 1e-12;
+/// Free runs are compared while a perturbation of 1e-12 has grown to no more than this.
+const WELL_CONDITIONED: f64 = 1e-9;
+/// Largest difference of a free run.
+const FREE_RUN: f64 = 1e-7;
 /// Worlds side by side: the recorded states of as many steps.
 const LANES: usize = 8;
 
@@ -46,184 +52,98 @@ impl<R: Real> Bodies<R> for Mixed<R> {
     }
 }
 
-/// The bodies in W worlds, and a step of them.
-struct World<'a, R, const W: usize, B> {
-    recording: &'a Recording,
-    physics: Physics<R>,
-    bodies: B,
-    /// x, y, vx, vy: `[bodies][W]` each.
-    state: [Vec<[R; W]>; 4],
-    forces: [Vec<[R; W]>; 3],
-    pairs: Pairs,
-}
-
-impl<'a, R: Real, const W: usize, B: Bodies<R>> World<'a, R, W, B> {
-    fn new(recording: &'a Recording, physics: Physics<R>, bodies: B) -> Self {
-        let zero = || vec![[R::ZERO; W]; recording.bodies.len()];
-        Self {
-            recording,
-            physics,
-            bodies,
-            state: [zero(), zero(), zero(), zero()],
-            forces: [zero(), zero(), zero()],
-            pairs: Pairs::new(),
-        }
-    }
-
-    /// Puts world `w` into a recorded state.
-    fn load(&mut self, w: usize, frame: &Frame) {
-        for i in 0..self.recording.bodies.len() {
-            let [x, y] = frame.positions[i];
-            let [vx, vy] = frame.velocities[i];
-            for (lanes, value) in self.state.iter_mut().zip([x, y, vx, vy]) {
-                lanes[i][w] = R::from_f64(value);
-            }
-        }
-    }
-
-    /// World w does the actions of step `steps[w]`.
-    fn step(&mut self, steps: [usize; W]) {
-        let [x, y, vx, vy] = &mut self.state;
-        let found = find_pairs(&self.bodies, (x, y), &mut self.pairs);
-        let [fx, fy, hits] = &mut self.forces;
-        let mut forces = Forces { x: fx, y: fy, hits };
-        forces.sum(&self.physics, &self.bodies, (x, y), &self.pairs[..found]);
-        let recording = self.recording;
-        let control = |i: usize| {
-            let (mut ux, mut uy) = ([R::ZERO; W], [R::ZERO; W]);
-            if i >= recording.agents {
-                return (ux, uy);
-            }
-            for w in 0..W {
-                let [dx, dy] = recording.directions[usize::from(recording.actions[steps[w]][i])];
-                ux[w] = self.physics.sensitivity * R::from_f64(dx);
-                uy[w] = self.physics.sensitivity * R::from_f64(dy);
-            }
-            (ux, uy)
-        };
-        Motion { x, y, vx, vy }.advance(&self.physics, &self.bodies, (fx, fy), control);
-    }
-
-    /// Largest difference of world `w` from a frame: positions, velocities; divided by max(1, |recorded|) if `relative`.
-    fn error(&self, w: usize, frame: &Frame, relative: bool) -> [f64; 2] {
-        let mut worst = [0.0; 2];
-        for i in 0..self.recording.bodies.len() {
-            let ([x, y], [vx, vy]) = (frame.positions[i], frame.velocities[i]);
-            for (k, recorded) in [x, y, vx, vy].into_iter().enumerate() {
-                let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
-                let error = (self.state[k][i][w].to_f64() - recorded).abs() / scale;
-                worst[k / 2] = worse(worst[k / 2], error);
-            }
-        }
-        worst
-    }
-}
-
-/// One step from every recorded state in f64 and in f32, and the free run: steps and worst position.
-type Errors = ([f64; 2], [f64; 2], (usize, f64));
-
-/// Measures everything in a [`MpeReport`].
-pub(super) fn verify(recording: &Recording) -> MpeReport {
+/// Compares the kernels and the authors' formulas with a recording.
+pub(super) fn verify(recording: &Recording) -> Report {
     let (double, single) = (physics::<f64>(recording), physics::<f32>(recording));
+    let (n, agent, ball) = (recording.agents, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS);
     // Standard bodies go through the very code of the rollouts, which knows their kinds.
-    let body = |size| Body { size, mass: 1.0, movable: true, collide: true };
-    let (agents, balls) = recording.bodies.split_at(recording.agents);
-    let standard = agents.iter().all(|&agent| agent == body(PushBallConfig::AGENT_RADIUS))
-        && balls.iter().all(|&ball| ball == body(PushBallConfig::BALL_RADIUS));
-    let errors = if !standard {
+    let standard = |bodies: &[Body], size| bodies.iter().all(|&body| body == Body::standard(size));
+    let (agents, balls) = recording.bodies.split_at(n);
+    let mut report = if !(standard(agents, agent) && standard(balls, ball)) {
         let bodies = &recording.bodies;
-        replay(
-            recording,
-            Mixed { bodies: bodies.clone(), physics: double },
-            Mixed { bodies: bodies.clone(), physics: single },
-        )
+        let mixed = Mixed { bodies: bodies.clone(), physics: double };
+        replay(recording, mixed, Mixed { bodies: bodies.clone(), physics: single })
     } else if balls.is_empty() {
         replay(recording, Alike(Pair::equal(&double, CONTACT_DISTANCE)), Alike(Pair::equal(&single, CONTACT_DISTANCE)))
     } else {
-        let n = recording.agents;
-        replay(
-            recording,
-            AgentsAndBalls::new(&double, n, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS),
-            AgentsAndBalls::new(&single, n, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS),
-        )
+        let kinds = AgentsAndBalls::new(&double, n, agent, ball);
+        replay(recording, kinds, AgentsAndBalls::new(&single, n, agent, ball))
     };
-    let (one_step, one_step_f32, free_run) = errors;
-    let mut report = MpeReport {
-        name: recording.name.clone(),
-        agents: recording.agents,
-        steps: recording.actions.len(),
-        one_step_position: one_step[0],
-        one_step_velocity: one_step[1],
-        one_step_position_f32: one_step_f32[0],
-        one_step_velocity_f32: one_step_f32[1],
-        free_run_steps: free_run.0,
-        free_run_position: free_run.1,
-        reward: 0.0,
-        success_rate: 0.0,
-        overlap_mismatches: 0,
-    };
+    let (mut rewards, mut successes, mut other_overlaps) = (0.0, 0.0, 0);
     for frame in &recording.frames {
         for (i, &reward) in frame.rewards.iter().enumerate() {
-            report.reward = worse(report.reward, (authors_reward(recording, frame, i) - reward).abs());
+            rewards = worse(rewards, (authors_reward(recording, frame, i) - reward).abs());
         }
-        let success = authors_success(recording, frame);
-        report.success_rate = worse(report.success_rate, (success - frame.success_rate).abs());
-        report.overlap_mismatches += usize::from(overlaps(recording, frame) != frame.overlaps);
+        successes = worse(successes, (authors_success(recording, frame) - frame.success_rate).abs());
+        other_overlaps += u32::from(overlaps(recording, frame) != frame.overlaps);
     }
+    report.limited("reward", rewards, ONE_STEP);
+    report.limited("success", successes, ONE_STEP);
+    report.limited("steps with other overlaps", other_overlaps.into(), 0.0);
     report
 }
 
-fn replay<A: Bodies<f64> + Clone, B: Bodies<f32>>(recording: &Recording, double: A, single: B) -> Errors {
-    (
-        one_step(World::new(recording, physics(recording), double.clone()), false),
-        one_step(World::new(recording, physics(recording), single), true),
-        free_run(World::new(recording, physics(recording), double)),
-    )
+/// One step from every recorded state, and the free run from the first one.
+fn replay<A: Bodies<f64> + Clone, B: Bodies<f32> + Clone>(recording: &Recording, double: A, single: B) -> Report {
+    let (agents, steps) = (recording.agents, recording.actions.len());
+    let free = recording.divergence.iter().take_while(|&&divergence| divergence <= WELL_CONDITIONED).count();
+    let mut report =
+        Report { content: format!("N = {agents}, {steps} steps, {free} of them free"), ..Report::default() };
+    report.limited("one step", one_step(recording, &double, false), ONE_STEP);
+    // There is no bound that holds for every recording.
+    let words = "contacts multiply the rounding of a position by their stiffness";
+    report.informative("one step in f32", one_step(recording, &single, true), words);
+    let mut world = worlds::<f64, 1, A>(recording, &recording.frames[..1], double);
+    let free_run = recording.actions[..free].iter().zip(&recording.frames[1..]).fold(0.0, |worst, (actions, frame)| {
+        world.step(0, actions);
+        worse(worst, apart(&world, std::slice::from_ref(frame), false)[0])
+    });
+    report.limited("free run", free_run, FREE_RUN);
+    report
 }
 
 fn physics<R: Real>(recording: &Recording) -> Physics<R> {
-    Physics::new(
-        recording.dt,
-        recording.damping,
-        recording.contact_force,
-        recording.contact_margin,
-        recording.sensitivity,
-    )
+    let Recording { dt, damping, contact_force, contact_margin, sensitivity, .. } = *recording;
+    Physics::new(dt, damping, contact_force, contact_margin, sensitivity)
 }
 
-/// One step from every recorded state.
-fn one_step<R: Real, B: Bodies<R>>(mut world: World<'_, R, LANES, B>, relative: bool) -> [f64; 2] {
-    let recording = world.recording;
-    let last = recording.actions.len().saturating_sub(1);
-    let mut worst = [0.0; 2];
-    for first in (0..recording.actions.len()).step_by(LANES) {
-        // Lanes beyond the last step repeat it.
-        let steps: [usize; LANES] = std::array::from_fn(|w| (first + w).min(last));
-        for (w, &step) in steps.iter().enumerate() {
-            world.load(w, &recording.frames[step]);
-        }
-        world.step(steps);
-        for (w, &step) in steps.iter().enumerate() {
-            let error = world.error(w, &recording.frames[step + 1], relative);
-            worst = [worse(worst[0], error[0]), worse(worst[1], error[1])];
-        }
-    }
-    worst
+/// Worlds in recorded states.
+fn worlds<R: Real, const W: usize, B: Bodies<R>>(recording: &Recording, frames: &[Frame], kinds: B) -> Swarm<R, W, B> {
+    let bodies = recording.bodies.len();
+    let numbers = |points: fn(&Frame) -> &[[f64; 2]]| -> Vec<R> {
+        let moving = frames.iter().flat_map(|frame| points(frame)[..bodies].as_flattened());
+        moving.map(|&number| R::from_f64(number)).collect()
+    };
+    let (positions, velocities) = (numbers(|frame| &frame.positions), numbers(|frame| &frame.velocities));
+    Swarm::new(physics(recording), kinds, (recording.agents, bodies), [&positions, &velocities, &[]], None)
 }
 
-/// Steps compared and the worst position on the way.
-fn free_run<B: Bodies<f64>>(mut world: World<'_, f64, 1, B>) -> (usize, f64) {
-    let recording = world.recording;
-    let conditioned = |&&divergence: &&f64| divergence <= MpeReport::WELL_CONDITIONED;
-    let steps = recording.divergence.iter().take_while(conditioned).count();
-    let mut worst = 0.0;
-    world.load(0, &recording.frames[0]);
-    for step in 0..steps {
-        world.step([step]);
-        let [error, _] = world.error(0, &recording.frames[step + 1], false);
-        worst = worse(worst, error);
-    }
-    (steps, worst)
+/// Largest difference of worlds from recorded frames: positions, velocities; over max(1, |recorded|) if `relative`.
+fn apart<R: Real, const W: usize, B: Bodies<R>>(worlds: &Swarm<R, W, B>, frames: &[Frame], relative: bool) -> [f64; 2] {
+    let bodies = worlds.bodies();
+    let mut ours = vec![R::ZERO; 2 * bodies * frames.len()];
+    let difference = |ours: &[R], points: fn(&Frame) -> &[[f64; 2]]| {
+        let recorded = frames.iter().flat_map(|frame| points(frame)[..bodies].as_flattened());
+        ours.iter().zip(recorded).fold(0.0, |worst, (&ours, &recorded)| {
+            let scale = if relative { recorded.abs().max(1.0) } else { 1.0 };
+            let ours: f64 = ours.into();
+            worse(worst, (ours - recorded).abs() / scale)
+        })
+    };
+    worlds.write_positions(&mut ours);
+    let positions = difference(&ours, |frame| &frame.positions);
+    worlds.write_velocities(&mut ours);
+    [positions, difference(&ours, |frame| &frame.velocities)]
+}
+
+/// The worst coordinate after one step from every recorded state.
+fn one_step<R: Real, B: Bodies<R> + Clone>(recording: &Recording, kinds: &B, relative: bool) -> f64 {
+    recording.actions.chunks(LANES).enumerate().fold(0.0, |worst, (block, actions)| {
+        let (first, last) = (LANES * block, LANES * block + actions.len());
+        let mut worlds = worlds::<R, LANES, B>(recording, &recording.frames[first..last], kinds.clone());
+        worlds.step(0, &actions.concat());
+        apart(&worlds, &recording.frames[first + 1..=last], relative).into_iter().fold(worst, worse)
+    })
 }
 
 /// As the authors write it: no fused operations, so that comparisons fall the same way.

@@ -78,7 +78,6 @@ pub(super) struct Points {
 }
 
 impl Points {
-    /// Adds a line of metrics.jsonl.
     pub(super) fn push(&mut self, line: &Value) {
         self.last += 1;
         let number = |value: Option<&Value>| value.and_then(Value::as_f64).map_or(f32::NAN, |x| x as f32);
@@ -87,16 +86,11 @@ impl Points {
         self.rows.push(Row { line: self.last, values });
         if self.rows.len() > KEPT {
             // From the newest backwards, so that the newest stays.
-            let newest = self.rows.len() - 1;
-            let mut index = 0;
-            self.rows.retain(|_| {
-                index += 1;
-                (newest + 1 - index).is_multiple_of(2)
-            });
+            self.rows = self.rows.drain(..).rev().step_by(2).collect();
+            self.rows.reverse();
         }
     }
 
-    /// Number of the last line.
     pub(super) fn last(&self) -> u64 {
         self.last
     }

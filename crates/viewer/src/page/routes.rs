@@ -1,7 +1,7 @@
 //! The page over HTTP: `/`, and the JSON that its script asks for.
 
 use super::{LivePage, points};
-use crate::scene::{SCRIPT, base64};
+use crate::scene::SCRIPT;
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::RawQuery;
@@ -13,11 +13,14 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::middleware::map_response;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use magex_proto::v1;
+use magex_runtime::sync::lock;
 use sha2::{Digest as _, Sha256};
 use std::future::Future;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 const PAGE: &str = include_str!("page.html");
 
@@ -79,7 +82,7 @@ fn policy(html: &[u8]) -> HeaderValue {
     let hash = |tag: &str| {
         let (open, close) = (format!("<{tag}>"), format!("</{tag}>"));
         let inside = html.split_once(&open).and_then(|(_, rest)| rest.split_once(&close)).map_or("", |(text, _)| text);
-        format!("'sha256-{}'", base64(&Sha256::digest(inside)))
+        format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(inside)))
     };
     let text = format!(
         "default-src 'none'; script-src {}; style-src {}; connect-src 'self'; img-src data:; base-uri 'none'; \
@@ -111,7 +114,7 @@ async fn limited(page: &LivePage, answer: impl Future<Output = Response>) -> Res
             .into_response();
     };
     let answer = answer.await;
-    page.answered();
+    *lock(&page.asked) = Some(Instant::now());
     answer
 }
 
@@ -121,7 +124,7 @@ fn json(body: Bytes) -> Response {
 
 /// The latest evaluation episode; 304 if the client has it already, 204 if there is none yet.
 fn episode_of(page: &LivePage, headers: &HeaderMap) -> Response {
-    let Some(episode) = page.episode() else { return StatusCode::NO_CONTENT.into_response() };
+    let Some(episode) = lock(&page.episode).clone() else { return StatusCode::NO_CONTENT.into_response() };
     let tag = format!("\"{}\"", episode.tag);
     if headers.get(IF_NONE_MATCH).is_some_and(|known| known.as_bytes() == tag.as_bytes()) {
         return (StatusCode::NOT_MODIFIED, [(ETAG, tag)]).into_response();

@@ -1,6 +1,9 @@
 use super::*;
+use crate::particles::batch::Batch;
 use crate::particles::cells::Cells;
 use crate::particles::physics::Pairs;
+use crate::particles::real::Real;
+use crate::rules::{Rules as _, Starts};
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::task::Spawn;
 
@@ -27,13 +30,14 @@ fn bits(values: &[f32]) -> Vec<u32> {
 /// Everything an episode produces, bit by bit.
 fn run<const W: usize>(task: &TaskConfig, state: &[Vec<f32>; 3], steps: &[Vec<u8>], cells: bool) -> Vec<Vec<u32>> {
     let [positions, velocities, landmarks] = state;
-    let mut batch = Batch::<f32, W>::new(task, positions, velocities, landmarks.clone(), cells).unwrap();
+    let starts = Starts::given(task, [positions, velocities, landmarks]).unwrap();
+    let mut batch = Batch::<W, SpreadObjective<W>>::new(task, &starts, cells).unwrap();
     let goals: Vec<u32> = (0..batch.swarm.worlds()).flat_map(|_| 0..task.agents as u32).collect();
-    batch.place_goals(&goals);
+    batch.set_goals(&goals);
     let mut log = Vec::new();
     for (t, actions) in steps.iter().enumerate() {
         let mut rewards = vec![0.0; actions.len()];
-        batch.advance(t as u32 + 1, actions, &mut rewards);
+        batch.step(t as u32 + 1, &goals, actions, &mut rewards);
         let mut state = vec![0.0; 2 * actions.len()];
         log.push(bits(&rewards));
         batch.swarm.write_positions(&mut state);
@@ -45,7 +49,7 @@ fn run<const W: usize>(task: &TaskConfig, state: &[Vec<f32>; 3], steps: &[Vec<u8
         let (reward, hits) = (batch.reward_sum[world / W][world % W], batch.hit_sum[world / W][world % W]);
         log.push(bits(&[reward as f32, hits as f32]));
         log.push(vec![batch.arrivals.step(world).unwrap_or(0)]);
-        log.push(batch.near(world).concat());
+        log.push(batch.objective.near(&batch.swarm, world).concat());
     }
     log
 }
@@ -88,12 +92,13 @@ fn cells_find_every_pair_once_even_far_outside_the_grid() {
 /// One step of one world in f64 without control: the change of the velocities beyond damping.
 fn kicks(positions: &[f64]) -> Vec<f64> {
     let agents = positions.len() / 2;
-    let task = TaskConfig::simple_spread(agents, Spawn::Uniform);
+    let kinds = Alike(Pair::equal(&Physics::standard(), CONTACT_DISTANCE));
     let rest = vec![0.0; positions.len()];
-    let mut batch = Batch::<f64, 4>::new(&task, positions, &rest, positions.to_vec(), false).unwrap();
-    batch.advance(1, &vec![0; agents], &mut vec![0.0; agents]);
+    let mut swarm =
+        Swarm::<f64, 4, _>::new(Physics::standard(), kinds, (agents, agents), [positions, &rest, positions], None);
+    swarm.step(0, &vec![0; agents]);
     let mut velocities = vec![0.0; positions.len()];
-    batch.swarm.write_velocities(&mut velocities);
+    swarm.write_velocities(&mut velocities);
     velocities
 }
 

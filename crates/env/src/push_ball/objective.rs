@@ -1,0 +1,125 @@
+//! What Push Ball pays for and counts.
+
+use super::constants::REACHED;
+use super::law::Legs;
+use crate::particles::batch::Objective;
+use crate::particles::physics::{AgentsAndBalls, Physics};
+use crate::particles::swarm::Swarm;
+use magex_core::error::FieldError;
+use magex_core::task::{PushBallConfig, TaskConfig};
+
+const REACHED2: f32 = REACHED as f32 * REACHED as f32;
+
+type Bodies = AgentsAndBalls<f32>;
+
+/// The reward and the goals: arrays are laid out like those of [`Swarm`], with N per block.
+pub(super) struct PushBallObjective<const W: usize> {
+    config: PushBallConfig,
+    /// Each agent's ball, and where that ball's landmark is.
+    ball: Vec<[u32; W]>,
+    lx: Vec<[f32; W]>,
+    ly: Vec<[f32; W]>,
+    /// Φ at the present positions.
+    potential: Vec<[f32; W]>,
+}
+
+impl<const W: usize> Objective<W> for PushBallObjective<W> {
+    type Bodies = Bodies;
+
+    const BODIES: usize = 2;
+
+    fn bodies(agents: usize) -> Bodies {
+        AgentsAndBalls::new(&Physics::standard(), agents, PushBallConfig::AGENT_RADIUS, PushBallConfig::BALL_RADIUS)
+    }
+
+    fn new(task: &TaskConfig, blocks: usize) -> Result<Self, FieldError> {
+        let zero = vec![[0.0; W]; blocks * task.agents];
+        let ball = vec![[0; W]; blocks * task.agents];
+        Ok(Self { config: *task.push_ball()?, ball, lx: zero.clone(), ly: zero.clone(), potential: zero })
+    }
+
+    fn cover2(&self) -> f32 {
+        REACHED2
+    }
+
+    fn place_goals(&mut self, swarm: &Swarm<f32, W, Bodies>, goals: &[u32]) {
+        let n = swarm.agents();
+        for (k, goal) in goals.chunks_exact(2).enumerate() {
+            let world = k / n;
+            let (place, w) = (world / W * n + k % n, world % W);
+            let [x, y] = swarm.landmark(world, goal[1] as usize);
+            (self.ball[place][w], self.lx[place][w], self.ly[place][w]) = (goal[0], x, y);
+        }
+        for own in 0..self.potential.len() {
+            self.potential[own] = self.legs(swarm, own / n, own % n).map(|legs| legs.potential);
+        }
+    }
+
+    #[inline(always)]
+    fn reward(&mut self, swarm: &Swarm<f32, W, Bodies>, block: usize, i: usize) -> [f32; W] {
+        let legs = self.legs(swarm, block, i);
+        let potential = &mut self.potential[block * swarm.agents() + i];
+        let mut lanes = [0.0; W];
+        for w in 0..W {
+            let bonus = if legs[w].last2 <= REACHED2 { self.config.bonus } else { 0.0 };
+            let owed = self.config.distance * legs[w].distance;
+            lanes[w] = self.config.progress.mul_add(legs[w].potential - potential[w], bonus - owed);
+            potential[w] = legs[w].potential;
+        }
+        lanes
+    }
+
+    /// Those that have any ball within reach.
+    fn covered(&self, swarm: &Swarm<f32, W, Bodies>, world: usize) -> usize {
+        let n = swarm.agents();
+        let (from, w) = swarm.place(world, n);
+        let points = |lanes: &[[f32; W]]| -> Vec<f32> { lanes[from..from + n].iter().map(|lanes| lanes[w]).collect() };
+        let (x, y) = (points(&swarm.x), points(&swarm.y));
+        let covered = |&landmark: &usize| {
+            let point = swarm.landmark(world, landmark);
+            let mut near = false;
+            for (&x, &y) in x.iter().zip(&y) {
+                near |= reaches([x, y], point);
+            }
+            near
+        };
+        (0..n).filter(covered).count()
+    }
+
+    /// Those whose own ball is within reach.
+    fn matched(&self, swarm: &Swarm<f32, W, Bodies>, world: usize, goals: &[u32]) -> usize {
+        let mut matched = vec![false; swarm.agents()];
+        for goal in goals.chunks_exact(2) {
+            let (ball, w) = swarm.place(world, swarm.agents() + goal[0] as usize);
+            let landmark = goal[1] as usize;
+            let at = [swarm.x[ball][w], swarm.y[ball][w]];
+            matched[landmark] |= reaches(at, swarm.landmark(world, landmark));
+        }
+        matched.iter().filter(|&&matched| matched).count()
+    }
+}
+
+impl<const W: usize> PushBallObjective<W> {
+    /// The legs of agent i of a block.
+    #[inline(always)]
+    fn legs(&self, swarm: &Swarm<f32, W, Bodies>, block: usize, i: usize) -> [Legs; W] {
+        let n = swarm.agents();
+        let own = block * n + i;
+        let (x, y) = (&swarm.x[swarm.block(block)], &swarm.y[swarm.block(block)]);
+        let (ball, lx, ly) = (&self.ball[own], &self.lx[own], &self.ly[own]);
+        // The balls are gathered first, so that the rest is plain arithmetic on vectors.
+        let (mut bx, mut by) = ([0.0; W], [0.0; W]);
+        for w in 0..W {
+            let ball = n + ball[w] as usize;
+            (bx[w], by[w]) = (x[ball][w], y[ball][w]);
+        }
+        let (ax, ay, turn) = (&x[i], &y[i], self.config.turn_length);
+        std::array::from_fn(|w| Legs::new((bx[w] - ax[w], by[w] - ay[w]), (lx[w] - bx[w], ly[w] - by[w]), turn))
+    }
+}
+
+#[inline(always)]
+fn reaches(body: [f32; 2], landmark: [f32; 2]) -> bool {
+    let (dx, dy) = (body[0] - landmark[0], body[1] - landmark[1]);
+    dx.mul_add(dx, dy * dy) <= REACHED2
+}
