@@ -1,5 +1,6 @@
 //! Clients of services: channels with TLS and credentials.
 
+use crate::Boxed;
 use crate::exit::{self, Failure};
 use crate::tls::ClientTls;
 use std::path::Path;
@@ -57,10 +58,12 @@ impl Settings {
     }
 
     /// A connected channel. Wrong usage has the exit code of [`Failure::usage`], a failed connection [`exit::UNAVAILABLE`].
-    pub async fn connect(&self, url: &str) -> Result<Channel, Failure> {
-        let (endpoint, bearer) = self.endpoint(url)?;
-        let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
-        Ok(InterceptedService::new(channel, bearer))
+    pub fn connect<'a>(&'a self, url: &'a str) -> Boxed<'a, Result<Channel, Failure>> {
+        Box::pin(async move {
+            let (endpoint, bearer) = self.endpoint(url)?;
+            let channel = endpoint.connect().await.map_err(|error| Failure::new(exit::UNAVAILABLE, root_of(&error)))?;
+            Ok(InterceptedService::new(channel, bearer))
+        })
     }
 
     fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), Failure> {

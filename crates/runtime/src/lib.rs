@@ -18,3 +18,10 @@ pub mod sync;
 pub mod telemetry;
 pub mod tls;
 pub mod trace;
+
+use std::future::Future;
+use std::pin::Pin;
+
+/// A future whose code is compiled in this crate. The body of an `async fn` is compiled again in every crate that awaits it,
+/// and here it brings a whole HTTP/2 stack along.
+pub type Boxed<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;

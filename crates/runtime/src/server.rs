@@ -1,5 +1,6 @@
 //! Listening and serving.
 
+use crate::Boxed;
 use crate::exit::{self, Failure};
 pub use crate::net::connections::Incoming;
 use crate::net::connections::{ConnectionLimits, Connections};
@@ -79,20 +80,22 @@ fn resolve_for(listen: &str, option: &str) -> Result<SocketAddr, String> {
 }
 
 /// Serves until `shutdown`, then stops accepting, waits at most `grace` for open calls, and drops the rest.
-pub async fn serve(
+pub fn serve(
     router: Router,
     incoming: Incoming,
     shutdown: CancellationToken,
     grace: Duration,
-) -> Result<(), tonic::transport::Error> {
-    let serving = router.serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
-    match within(serving, shutdown, grace).await {
-        Some(result) => result,
-        None => {
-            tracing::debug!(grace_seconds = grace.as_secs_f64(), "dropped connections that did not close");
-            Ok(())
+) -> Boxed<'static, Result<(), tonic::transport::Error>> {
+    Box::pin(async move {
+        let serving = router.serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+        match within(serving, shutdown, grace).await {
+            Some(result) => result,
+            None => {
+                tracing::debug!(grace_seconds = grace.as_secs_f64(), "dropped connections that did not close");
+                Ok(())
+            }
         }
-    }
+    })
 }
 
 /// The future's value, or `None` if it is not ready `grace` after `shutdown`.

@@ -215,10 +215,8 @@ fn pack(values: &[f32], wide: bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use base64::Engine as _;
-    use base64::prelude::BASE64_STANDARD;
-    use magex_core::error::{FieldError, check_count};
     use magex_core::metrics_table::SECOND_COST_RATIO;
+    use magex_core::statics::Statics;
     use magex_core::task::Spawn;
     use magex_core::task::TaskName;
 

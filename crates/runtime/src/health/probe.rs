@@ -1,5 +1,6 @@
 //! Health check of a service, for orchestrators that run it inside the service's container.
 
+use crate::Boxed;
 use crate::client::{endpoint_from_env, root_of};
 use crate::exit::{self, Failure};
 use std::time::Duration;
@@ -19,15 +20,17 @@ const PAGE: u64 = 4096;
 /// Checks the service at `url` once. A URL without a path is checked over gRPC (grpc.health.v1) for `service`, or for the whole
 /// process if that is empty; https uses the certificates that `MAGEX_TLS_CA`, `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` name. A URL
 /// with a path is a page, such as http://host:port/healthz, that must answer 200.
-pub async fn ask(url: &str, service: &str, deadline: Duration) -> Result<(), Failure> {
-    let asking = async {
+pub fn ask<'a>(url: &'a str, service: &'a str, deadline: Duration) -> Boxed<'a, Result<(), Failure>> {
+    let asking = async move {
         match page_of(url) {
             Some((authority, path)) => ask_page(url, authority, path).await,
             None => ask_grpc(url, service).await,
         }
     };
-    let late = |_| unhealthy(format!("{url} did not answer within {} s", deadline.as_secs_f64()));
-    tokio::time::timeout(deadline, asking).await.map_err(late)?
+    Box::pin(async move {
+        let late = |_| unhealthy(format!("{url} did not answer within {} s", deadline.as_secs_f64()));
+        tokio::time::timeout(deadline, asking).await.map_err(late)?
+    })
 }
 
 fn unhealthy(problem: String) -> Failure {
