@@ -164,9 +164,9 @@ impl Missions {
     fn room(&self, kept: &Kept, owner: &str) -> Result<(), KeepError> {
         let own = kept.values().filter(|mission| mission.assignment.owner == owner).count();
         let (total, per_owner) = (self.bounds.total, self.bounds.per_owner);
-        for (who, count, most) in [("service", kept.len(), total), ("client", own, per_owner)] {
+        for (limited, count, most) in [("service", kept.len(), total), ("client", own, per_owner)] {
             if count >= most {
-                return Err(KeepError::Full(format!("the {who} is at its limit of {most} missions; delete some")));
+                return Err(KeepError::Full(format!("the {limited} is at its limit of {most} missions; delete some")));
             }
         }
         Ok(())

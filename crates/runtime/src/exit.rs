@@ -1,8 +1,5 @@
 //! Exit codes, as in sysexits.h, and the outcome of a command.
 
-use crate::process::ensure_environment;
-use std::process::ExitCode;
-
 /// Success.
 pub const OK: u8 = 0;
 /// The work failed.
@@ -39,34 +36,5 @@ impl Failure {
     /// Wrong usage or configuration.
     pub fn usage(message: impl ToString) -> Self {
         Self::new(USAGE, message)
-    }
-}
-
-/// Runs the body of a service's command with the arguments of this process, in the environment that it needs: usage errors exit
-/// with [`USAGE`], failures are printed to standard error and exit with their code. `main` calls this before anything else.
-pub fn run<P: clap::Parser>(body: impl FnOnce(P) -> Result<u8, Failure>) -> ExitCode {
-    if let Err(error) = ensure_environment() {
-        return report(Err(Failure::new(INTERNAL, error)));
-    }
-    let arguments = match P::try_parse() {
-        Ok(arguments) => arguments,
-        Err(error) => {
-            // Help and version are no errors. A closed terminal does not matter.
-            let _ = error.print();
-            return ExitCode::from(if error.use_stderr() { USAGE } else { OK });
-        }
-    };
-    report(body(arguments))
-}
-
-/// The exit code of a result; a failure is printed to standard error.
-#[allow(clippy::print_stderr, reason = "the one place that prints why a command failed")]
-fn report(result: Result<u8, Failure>) -> ExitCode {
-    match result {
-        Ok(code) => ExitCode::from(code),
-        Err(failure) => {
-            eprintln!("error: {failure}");
-            ExitCode::from(failure.code)
-        }
     }
 }
