@@ -103,7 +103,7 @@ pub fn print(text: &str) {
     let _ = std::io::stdout().lock().write_all(text.as_bytes());
 }
 
-/// Prints [`ready_line`] to standard output, the only line that a running service writes there.
+/// Prints the ready line to standard output, the only line that a running service writes there.
 pub fn announce_ready(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) {
     let mut stdout = std::io::stdout().lock();
     // A closed pipe is not an error.
