@@ -28,8 +28,9 @@ pub(crate) trait Objective<const W: usize>: Sized + Send {
     /// Takes goals [B, N, K].
     fn place_goals(&mut self, swarm: &Swarm<f32, W, Self::Bodies>, goals: &[u32]);
 
-    /// What agent `i` of a block is paid for the step that led to the present positions.
-    fn reward(&mut self, swarm: &Swarm<f32, W, Self::Bodies>, block: usize, i: usize) -> [f32; W];
+    /// Writes what each agent of a block [N] is paid for the step that led to the present positions; returns the sums over the
+    /// agents. Summed in the same loop: without a sum the compiler makes vectors of agents, which it gathers, not of worlds.
+    fn rewards(&mut self, swarm: &Swarm<f32, W, Self::Bodies>, block: usize, rewards: &mut [[f32; W]]) -> [f32; W];
 
     /// Landmarks of a world that are covered.
     fn covered(&self, swarm: &Swarm<f32, W, Self::Bodies>, world: usize) -> usize;
@@ -79,12 +80,11 @@ impl<const W: usize, O: Objective<W>> Batch<W, O> {
 
     /// Rewards of a block at the present positions.
     fn pay(&mut self, block: usize, rewards: &mut [f32]) {
-        let (mut reward_sum, mut hit_sum) = ([0.0; W], [0.0; W]);
+        let reward_sum = self.objective.rewards(&self.swarm, block, &mut self.rewards);
+        let mut hit_sum = [0.0; W];
         let first = self.swarm.block(block).start;
-        for (i, (lanes, hits)) in self.rewards.iter_mut().zip(&self.swarm.hits[first..]).enumerate() {
-            *lanes = self.objective.reward(&self.swarm, block, i);
+        for hits in &self.swarm.hits[first..first + self.rewards.len()] {
             for w in 0..W {
-                reward_sum[w] += lanes[w];
                 hit_sum[w] += hits[w];
             }
         }

@@ -155,7 +155,7 @@ pub fn find_pairs<R: Real, const W: usize, B: Bodies<R>>(
     let mut found = 0;
     for i in 0..n {
         let (xi, yi) = (x[i], y[i]);
-        for (j, (xj, yj)) in x.iter().zip(y).enumerate().skip(i + 1) {
+        for (j, (xj, yj)) in (i + 1..).zip(x[i + 1..].iter().zip(&y[i + 1..])) {
             let reach2 = bodies.pair(i, j).reach2;
             let mut near = false;
             for w in 0..W {

@@ -55,18 +55,20 @@ impl<const W: usize> Objective<W> for PushBallObjective<W> {
         }
     }
 
-    #[inline(always)]
-    fn reward(&mut self, swarm: &Swarm<f32, W, Bodies>, block: usize, i: usize) -> [f32; W] {
-        let legs = self.legs(swarm, block, i);
-        let potential = &mut self.potential[block * swarm.agents() + i];
-        let mut lanes = [0.0; W];
-        for w in 0..W {
-            let bonus = if legs[w].last2 <= REACHED2 { self.config.bonus } else { 0.0 };
-            let owed = self.config.distance * legs[w].distance;
-            lanes[w] = self.config.progress.mul_add(legs[w].potential - potential[w], bonus - owed);
-            potential[w] = legs[w].potential;
+    fn rewards(&mut self, swarm: &Swarm<f32, W, Bodies>, block: usize, rewards: &mut [[f32; W]]) -> [f32; W] {
+        let mut sum = [0.0; W];
+        for (i, lanes) in rewards.iter_mut().enumerate() {
+            let legs = self.legs(swarm, block, i);
+            let potential = &mut self.potential[block * swarm.agents() + i];
+            for w in 0..W {
+                let bonus = if legs[w].last2 <= REACHED2 { self.config.bonus } else { 0.0 };
+                let owed = self.config.distance * legs[w].distance;
+                lanes[w] = self.config.progress.mul_add(legs[w].potential - potential[w], bonus - owed);
+                potential[w] = legs[w].potential;
+                sum[w] += lanes[w];
+            }
         }
-        lanes
+        sum
     }
 
     /// Those that have any ball within reach.

@@ -60,19 +60,23 @@ impl<const W: usize> Objective<W> for SpreadObjective<W> {
         }
     }
 
-    #[inline(always)]
-    fn reward(&mut self, swarm: &Swarm<f32, W, Alike<f32>>, block: usize, i: usize) -> [f32; W] {
-        let own = swarm.block(block).start + i;
-        let (x, y, hits, gx, gy) = (&swarm.x[own], &swarm.y[own], &swarm.hits[own], &self.gx[own], &self.gy[own]);
-        let mut lanes = [0.0; W];
-        for w in 0..W {
-            let (dx, dy) = (x[w] - gx[w], y[w] - gy[w]);
-            let d2 = dx.mul_add(dx, dy * dy);
-            let bonus = if d2 <= self.cover2 { self.bonus } else { 0.0 };
-            let charged = self.collision.mul_add(hits[w], self.per_distance * d2.sqrt());
-            lanes[w] = bonus - charged;
+    fn rewards(&mut self, swarm: &Swarm<f32, W, Alike<f32>>, block: usize, rewards: &mut [[f32; W]]) -> [f32; W] {
+        let n = swarm.block(block);
+        let (x, y, hits) = (&swarm.x[n.clone()], &swarm.y[n.clone()], &swarm.hits[n.clone()]);
+        let (gx, gy) = (&self.gx[n.clone()], &self.gy[n]);
+        let (bonus, per_distance, collision, cover2) = (self.bonus, self.per_distance, self.collision, self.cover2);
+        let mut sum = [0.0; W];
+        for (i, lanes) in rewards.iter_mut().enumerate() {
+            for w in 0..W {
+                let (dx, dy) = (x[i][w] - gx[i][w], y[i][w] - gy[i][w]);
+                let d2 = dx.mul_add(dx, dy * dy);
+                let bonus = if d2 <= cover2 { bonus } else { 0.0 };
+                let charged = collision.mul_add(hits[i][w], per_distance * d2.sqrt());
+                lanes[w] = bonus - charged;
+                sum[w] += lanes[w];
+            }
         }
-        lanes
+        sum
     }
 
     fn covered(&self, swarm: &Swarm<f32, W, Alike<f32>>, world: usize) -> usize {
