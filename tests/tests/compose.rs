@@ -197,7 +197,8 @@ fn the_cluster_trains_scales_and_survives_and_learns_the_same_bits() {
     // Up, and to the target.
     let file = project.choose("target", SPREAD);
     let clock = Instant::now();
-    project.compose("up --detach --scale actor=2");
+    project.set("MAGEX_ACTORS", "2");
+    project.compose("up --detach");
     project.wait_for_health(4);
     println!("up to all healthy: {:.1} s", clock.elapsed().as_secs_f64());
     let summary = project.summary("target");
@@ -209,9 +210,11 @@ fn the_cluster_trains_scales_and_survives_and_learns_the_same_bits() {
     let mut config = RunConfig::from_toml(SPREAD).unwrap();
     (config.run.target_success, config.run.max_steps, config.run.checkpoint_every) = (2.0, 14 * 1200, 2);
     let file = project.choose("disturbed", &config.to_toml().unwrap());
-    project.compose("up --detach --scale actor=2");
+    project.compose("up --detach");
+    assert_eq!(project.containers("actor").len(), 2, "another up keeps the actors");
     project.wait_for_iterations("disturbed", 2);
-    project.compose("up --detach --no-recreate --scale actor=4");
+    project.set("MAGEX_ACTORS", "4");
+    project.compose("up --detach --no-recreate");
     assert_eq!(project.containers("actor").len(), 4);
 
     docker(&format!("kill {}", project.container("actor")));
@@ -241,7 +244,8 @@ fn the_cluster_trains_scales_and_survives_and_learns_the_same_bits() {
     } else {
         println!("the engine's processes are not ours to kill: the restart policy was not tried");
     }
-    project.compose("up --detach --no-recreate --scale actor=1");
+    project.set("MAGEX_ACTORS", "1");
+    project.compose("up --detach --no-recreate");
     assert_eq!(project.containers("actor").len(), 1);
     let disturbed = project.summary("disturbed");
     assert_eq!(disturbed["weights_sha256"], in_process(&file), "whatever happened in between");
@@ -267,7 +271,7 @@ fn with_certificates_the_cluster_accepts_known_clients_only() {
     done(Command::new(root().join("deploy/certificates")).arg(&certificates));
     project.set("MAGEX_CERTIFICATES", certificates.display().to_string());
     let file = project.choose("short", SHORT);
-    project.compose("up --detach --scale actor=2");
+    project.compose("up --detach");
     project.wait_for_health(4);
     assert_eq!(project.summary("short")["weights_sha256"], in_process(&file));
 
