@@ -12,7 +12,8 @@ pub trait Collector: Send {
     /// Publishes a version of the weights to all actors and commanders. Precedes every plan that names it.
     fn publish(&mut self, weights: &Arc<Weights>) -> Result<(), CollectError>;
 
-    /// Collects the results of all shards of a plan, in the order of the plan.
+    /// Collects the results of all shards of a plan, in the order of the plan. [`CollectError::Stopped`]: a stop was requested, and
+    /// nothing is returned.
     fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError>;
 
     /// Whether the trainer should write a checkpoint and return after the current iteration.

@@ -59,7 +59,10 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// A new run in an existing, empty folder.
+    /// A new run in an existing, empty folder, with checkpoint 0.
+    ///
+    /// # Errors
+    /// A configuration that its task or networks reject; a folder that cannot be written.
     pub fn create(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mut trainer = Self::prepare(config, run_id, folder, threads)?;
         trainer.observe(MetricsFile::create(folder)?);
@@ -70,6 +73,9 @@ impl Trainer {
 
     /// A run that continues from its newest usable checkpoint; the errors of newer ones are returned. A complete run is not
     /// changed.
+    ///
+    /// # Errors
+    /// No usable checkpoint; one of another configuration or format; metrics.jsonl that cannot be read.
     pub fn resume(
         config: &RunConfig,
         folder: &Path,
@@ -153,6 +159,9 @@ impl Trainer {
     }
 
     /// Trains until the target is reached, the budget is spent, or a stop is requested.
+    ///
+    /// # Errors
+    /// Shards that no actor can compute; networks or files that fail. A checkpoint that cannot be written is retried.
     pub fn run(&mut self, collector: &mut dyn Collector) -> Result<TrainOutcome, TrainError> {
         let outcome = self.train(collector);
         let end = match &outcome {

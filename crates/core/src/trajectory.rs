@@ -24,7 +24,7 @@ pub struct Shape {
     pub dims: usize,
     /// X: further numbers of an agent's state (drones: 6).
     pub agent_state: usize,
-    /// K: targets per agent (Simple Spread: 1, its landmark; Push Ball: 2, its ball and the ball's landmark).
+    /// K: goals per agent (Simple Spread: 1, its landmark; Push Ball: 2, its ball and the ball's landmark).
     pub goals_per_agent: usize,
     /// H: components of an action.
     pub action_components: usize,
@@ -52,7 +52,7 @@ pub struct Trajectory {
     pub actions: Vec<u8>,
     /// [T, B, N] log-probability of the whole action under the weights named by the shard.
     pub log_probs: Vec<f32>,
-    /// [T, B, N]
+    /// [T, B, N] reward of the state after action t.
     pub rewards: Vec<f32>,
     /// [B, K] log-probability of the commander's assignment of each stage.
     pub goal_log_probs: Vec<f32>,

@@ -64,7 +64,7 @@ fn with_workspace<T>(problem: &Problem, work: impl FnOnce(&mut Workspace) -> T) 
 }
 
 /// Solves by a method; the exact one answers in place of the learned one. `should_continue` is called from time to time.
-/// It is interrupted when that returns false.
+/// When that returns false, the answer is [`AssignError::Interrupted`].
 pub fn solve(
     problem: &Problem,
     kind: AssignmentMethod,

@@ -1,6 +1,7 @@
 //! All missions of a service, in memory and optionally on disk, bounded in number and age. Readers never wait for the disk.
 //!
-//! An update writes revision r + 1 and commits it only if r is still current; otherwise the caller re-plans.
+//! An update replaces revision r by r + 1 under one lock: it checks that r is still current, writes r + 1 to disk, and shows it
+//! to readers. If r has changed, the caller plans again.
 
 use crate::disk::{Disk, DiskError, Kept};
 use crate::mission::{Mission, MissionLimits};

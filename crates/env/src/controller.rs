@@ -25,7 +25,7 @@ pub trait Controller: Send {
     fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), FieldError>;
 }
 
-/// Q, the number of episodes, if every array fits the task and the number of joint states that `actions` is for.
+/// B, the number of episodes, if every array fits the task and the number of joint states that `actions` is for.
 fn check(task: &TaskConfig, state: &JointState<'_>, actions: &[u8]) -> Result<usize, FieldError> {
     let (shape, stages) = (task.shape(1), task.stages());
     let (of_team, goals) = (shape.agents * shape.action_components, shape.agents * stages.len());

@@ -80,7 +80,9 @@ pub fn build(
 ) -> Result<Box<dyn Network>, ParamError> {
     Ok(match config.kind {
         ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, params)?),
-        _ => Box::new(TeamNet::build(config, spec, outputs, head_gain, params)?),
+        ExecutorKind::Magex | ExecutorKind::MagexLiteral | ExecutorKind::Attention | ExecutorKind::Mlp => {
+            Box::new(TeamNet::build(config, spec, outputs, head_gain, params)?)
+        }
     })
 }
 

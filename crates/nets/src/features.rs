@@ -87,7 +87,8 @@ impl FeatureSpec {
         2 * self.shape.dims + 1 + approach + usize::from(self.shape.bodies > self.shape.agents)
     }
 
-    /// Features of all agents of all states.
+    /// Features of all agents of the given states, [Q·N] rows. The states are [Q, E, D] with statics [B, …] and goals [B, N, K] of
+    /// the B episodes that they are of, episode innermost: state q is of episode q mod B.
     pub fn compute(&self, states: &JointState<'_>) -> Features {
         let (n, d, joint) = (self.shape.agents, self.shape.dims, self.shape.bodies * self.shape.dims);
         let (count, landmarks) = (states.positions.len() / joint, states.landmarks());

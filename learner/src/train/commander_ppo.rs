@@ -81,13 +81,14 @@ impl CommanderPpo {
         Commander::of(&self.config, self.agents, self.dims, &network.params)
     }
 
-    /// One update on the decisions of an iteration's episodes. Does nothing if the scheduler is not learned.
+    /// One update on the decisions of an iteration's episodes, with `rate_factor` (0 to 1) of the configured step size. Does
+    /// nothing if the scheduler is not learned.
     pub fn update(
         &self,
         learned: &mut Learned,
         trajectories: &[Trajectory],
         iteration: u32,
-        progress_rate: f64,
+        rate_factor: f64,
     ) -> Result<CommanderStats, CommanderError> {
         if !self.config.kind.learned() {
             return Ok(CommanderStats::default());
@@ -134,7 +135,7 @@ impl CommanderPpo {
         if samples.is_empty() {
             return Ok(CommanderStats { skipped, ..CommanderStats::default() });
         }
-        let mut stats = self.improve(network, &samples, iteration, progress_rate)?;
+        let mut stats = self.improve(network, &samples, iteration, rate_factor)?;
         stats.greedy_cost_ratio = ratio_sum / samples.len().max(1) as f64;
         stats.first_ratio_error = error;
         stats.skipped += skipped;
@@ -147,7 +148,7 @@ impl CommanderPpo {
         network: &mut Network,
         samples: &[Sample],
         iteration: u32,
-        progress_rate: f64,
+        rate_factor: f64,
     ) -> Result<CommanderStats, CommanderError> {
         let c = &self.config;
         // Scaled, not centred: the self-critical baseline already is the centre.
@@ -179,7 +180,7 @@ impl CommanderPpo {
                 // Adam takes no step along a gradient that is not finite.
                 let usable = surrogate.is_finite()
                     && entropy.is_finite()
-                    && self.descend(network, &variables, &loss, progress_rate)?.is_finite();
+                    && self.descend(network, &variables, &loss, rate_factor)?.is_finite();
                 if !usable {
                     stats.skipped += 1.0;
                     continue;
@@ -208,11 +209,11 @@ impl CommanderPpo {
         network: &mut Network,
         variables: &[Var],
         loss: &Tensor,
-        progress_rate: f64,
+        rate_factor: f64,
     ) -> Result<f64, CommanderError> {
         let gradient = network.params.gradient(variables, &loss.backward()?)?;
         let c = &self.config;
-        let (rate, max_norm) = (c.learning_rate * progress_rate, c.max_grad_norm.into());
+        let (rate, max_norm) = (c.learning_rate * rate_factor, c.max_grad_norm.into());
         Ok(network.adam.step(&mut network.params.values, &gradient, rate, 1e-5, max_norm))
     }
 

@@ -1,13 +1,13 @@
 //! Keys and dependencies are documented, with the defaults that the code has.
 
-use crate::workspace::read;
+use crate::workspace::{files, read};
 use magex_core::config::RunConfig;
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 
 /// Every configuration key with its default, as TOML: the default run, and the sections of the other tasks.
 pub(crate) fn configuration() -> String {
     let mut config = RunConfig::default().to_toml().unwrap();
-    for name in [TaskName::PushBall, TaskName::Drones] {
+    for name in TaskName::ALL.into_iter().filter(|&name| name != RunConfig::default().task.name) {
         let task = TaskConfig::of(name, 4, Spawn::Uniform);
         let other = RunConfig { task, ..RunConfig::default() }.to_toml().unwrap();
         let own = other.split("\n\n").find(|section| section.starts_with("[task.")).unwrap();
@@ -50,6 +50,23 @@ fn every_configuration_key_and_dependency_is_documented() {
             && !name.starts_with('#')
         {
             assert!(dependencies.contains(&format!("`{name}`")), "docs/dependencies.md does not say why {name}");
+        }
+    }
+}
+
+/// What an operator searches logs for is there to be found.
+#[test]
+fn messages_that_the_failure_table_quotes_exist() {
+    let product = files(&[".rs"]).into_iter().filter(|file| !file.starts_with("tests"));
+    let sources: String = product.map(|file| read(&file.to_string_lossy())).collect();
+    let page = read("docs/operations.md");
+    let (_, table) = page.split_once("## Failure by failure").unwrap();
+    for row in table.lines().filter(|line| line.starts_with("| ")).skip(1) {
+        let symptom = row.split(" | ").nth(1).unwrap_or_default();
+        for quoted in symptom.split('`').skip(1).step_by(2) {
+            // N stands for a number.
+            let found = quoted.split(" N ").all(|piece| sources.contains(piece));
+            assert!(found, "docs/operations.md quotes a message that no program writes: {quoted}");
         }
     }
 }
