@@ -85,6 +85,9 @@ pub struct Progress {
     pub run_id: String,
     /// Fingerprint of the effective configuration.
     pub config_sha256: String,
+    /// The effective configuration, TOML; empty in older checkpoints.
+    #[serde(default)]
+    pub config: String,
     /// Iterations completed.
     pub iteration: u32,
     /// Joint environment steps trained on.
@@ -292,6 +295,16 @@ pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
         // Any other number may be a flipped bit: `read` tells damage from another format.
         _ => Ok(()),
     }
+}
+
+/// The configuration that the newest readable checkpoint was made with, whatever its networks look like.
+pub fn configuration(run: &Path) -> Option<String> {
+    #[derive(Deserialize)]
+    struct Counters {
+        progress: Progress,
+    }
+    let read = |folder: &PathBuf| serde_json::from_slice::<Counters>(&fs::read(folder.join("state.json")).ok()?).ok();
+    list(run).iter().rev().find_map(read).map(|state| state.progress.config).filter(|config| !config.is_empty())
 }
 
 /// The newest checkpoint that can be read, and what was wrong with the newer ones. One of another format is not damage: what

@@ -1,6 +1,6 @@
 //! `magex replay`
 
-use crate::artifacts::{describe, write_replay};
+use crate::artifacts::{self, describe, write_replay};
 use crate::evaluate::{Controller, Episodes, Modes, Subject, mode_name, roll_out};
 use crate::options::CommonOptions;
 use magex_runtime::exit;
@@ -39,6 +39,7 @@ pub(crate) struct ReplayArgs {
 
 pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let output = options.output();
+    args.out.as_deref().map_or(Ok(()), artifacts::check)?;
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
     let policy = vary.policy(&config, &trained.weights)?;
