@@ -297,13 +297,18 @@ pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
     }
 }
 
-/// The configuration that the newest readable checkpoint was made with, whatever its networks look like.
+/// The configuration that the newest undamaged checkpoint was made with, whatever its networks look like.
 pub fn configuration(run: &Path) -> Option<String> {
     #[derive(Deserialize)]
     struct Counters {
         progress: Progress,
     }
-    let read = |folder: &PathBuf| serde_json::from_slice::<Counters>(&fs::read(folder.join("state.json")).ok()?).ok();
+    let read = |folder: &PathBuf| {
+        let (manifest, state) = (fs::read(folder.join(MANIFEST)).ok()?, fs::read(folder.join("state.json")).ok()?);
+        let manifest: Manifest = serde_json::from_slice(&manifest).ok()?;
+        let whole = manifest.sha256.get("state.json") == Some(&sha256::hex(&state));
+        serde_json::from_slice::<Counters>(&state).ok().filter(|_| whole)
+    };
     list(run).iter().rev().find_map(read).map(|state| state.progress.config).filter(|config| !config.is_empty())
 }
 

@@ -127,7 +127,7 @@ async fn train(
     let stop = context.stop.clone();
     let (claim, mut trainer) = prepare(args, &config, &toml, parent.as_ref())?;
     let claim = Arc::new(claim);
-    let (stopped, claimed) = (stop.clone(), claim.clone());
+    let (stopped, claimed, begun) = (stop.clone(), claim.clone(), claim.clone());
     tokio::spawn(async move {
         stopped.cancelled().await;
         claimed.lock.stopping();
@@ -167,7 +167,10 @@ async fn train(
             // The folder stays locked while this thread may write to it.
             drop(claim);
         })
-        .map_err(|error| limits::no_thread(&error, "the training thread cannot be started"))?;
+        .map_err(|error| {
+            begun.abandon();
+            limits::no_thread(&error, "the training thread cannot be started")
+        })?;
     let outcome = tokio::select! {
         outcome = training_end => Some(outcome),
         () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,

@@ -72,8 +72,10 @@ pub enum FolderError {
 
 fn remedy(state: RunFolderState) -> &'static str {
     match state {
-        RunFolderState::Run | RunFolderState::Begun => "add --resume to continue the run in it, or choose another --out",
-        _ => "it is not a run folder, or its checkpoints are missing; choose another --out",
+        RunFolderState::Run | RunFolderState::Begun => {
+            "add --resume to continue the run in it, or choose another folder"
+        }
+        _ => "it is not a run folder, or its checkpoints are missing; choose another folder",
     }
 }
 
@@ -99,7 +101,9 @@ impl Claim {
             RunFolderState::Begun if again => None,
             state => Some(FolderError::Exists(out.to_owned(), state)),
         };
-        if let Ok(target) = fs::read_link(out) && !out.exists() {
+        if let Ok(target) = fs::read_link(out)
+            && !out.exists()
+        {
             return Err(FolderError::Dangling(out.to_owned(), target));
         }
         // Before anything is written: the lock file does not belong into a folder of something else.
@@ -141,13 +145,17 @@ impl Claim {
         Ok(Self { lock, folder: out.to_owned(), made: None })
     }
 
-    /// Removes what [`Self::begin`] and the run made, because nothing was started. Does nothing to a folder that was not empty.
+    /// Removes what [`Self::begin`] and the run made, because nothing was started. Does nothing to a folder that was not empty,
+    /// or in which an iteration was trained.
     pub fn abandon(&self) {
-        let Some(made) = &self.made else { return };
+        let trained = fs::metadata(self.folder.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+        let Some(made) = self.made.as_ref().filter(|_| !trained) else { return };
         for name in BEGINNING.iter().chain([&LOCK_FILE]) {
             let path = self.folder.join(name);
             let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-            if let Err(error) = removed.or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) }) {
+            if let Err(error) =
+                removed.or_else(|error| if error.kind() == ErrorKind::NotFound { Ok(()) } else { Err(error) })
+            {
                 tracing::debug!(%error, path = %path.display(), "cannot be removed");
             }
         }
@@ -204,6 +212,11 @@ mod tests {
         assert!(matches!(Claim::begin(&out, "", "test", false), Err(FolderError::Exists(_, RunFolderState::Run))));
         claim.abandon();
         assert!(!place.path().join("a").exists());
+        // What was trained stays.
+        let claim = Claim::begin(&out, "", "test", false).unwrap();
+        fs::write(out.join("metrics.jsonl"), "{}\n").unwrap();
+        claim.abandon();
+        assert!(out.join(CONFIG_FILE).exists());
         // An empty folder of the user's stays, and so does what a run left before.
         fs::create_dir(&here).unwrap();
         Claim::begin(&here, "", "test", false).unwrap().abandon();

@@ -112,7 +112,8 @@ impl RunLock {
     pub fn inherited(folder: &Path, descriptor: i32, command: &str) -> Result<Self, LockError> {
         let path = folder.join(LOCK_FILE);
         let own = std::fs::metadata(format!("/proc/self/fd/{descriptor}"));
-        let same = matches!((own, std::fs::metadata(&path)), (Ok(a), Ok(b)) if (a.dev(), a.ino()) == (b.dev(), b.ino()));
+        let same =
+            matches!((own, std::fs::metadata(&path)), (Ok(a), Ok(b)) if (a.dev(), a.ino()) == (b.dev(), b.ino()));
         if !same {
             return Err(LockError::NotInherited { descriptor, folder: folder.to_owned() });
         }

@@ -27,13 +27,12 @@ pub(crate) struct Changes {
 }
 
 impl Changes {
-    pub(crate) fn between(own: &RunConfig, requested: &RunConfig) -> Result<Self, TrainError> {
-        // By their text: a value prints as it is written.
-        let table = |config: &RunConfig| {
-            Ok::<_, TrainError>(config.to_toml()?.parse::<Table>().map_err(|error| ConfigError(error.to_string()))?)
-        };
+    /// From one configuration to another, both as TOML: a value prints as it is written.
+    pub(crate) fn between(own: &str, requested: &str) -> Result<Self, ConfigError> {
+        let table =
+            |text: &str| text.parse::<Table>().map(Value::Table).map_err(|error| ConfigError(error.to_string()));
         let mut keys = Vec::new();
-        collect("", &Value::Table(table(own)?), &Value::Table(table(requested)?), &mut keys);
+        collect("", &table(own)?, &table(requested)?, &mut keys);
         Ok(Self { keys })
     }
 
@@ -84,6 +83,24 @@ fn collect(path: &str, own: &Value, requested: &Value, keys: &mut Vec<(String, S
         _ if own == requested => {}
         _ => keys.push((path.to_owned(), format!("{path} was {own} and is {requested}"))),
     }
+}
+
+/// The configuration that a run continues with, and how it differs from that of its checkpoints.
+pub(crate) fn continued(folder: &Path, requested: &RunConfig) -> Result<(RunConfig, Changes), ConfigError> {
+    let mut config = requested.clone();
+    // Checkpoints of older builds do not hold their configuration.
+    let own = checkpoint::configuration(folder).or_else(|| std::fs::read_to_string(folder.join(CONFIG_FILE)).ok());
+    let Some(mut text) = own else { return Ok((config, Changes::default())) };
+    if let Ok(own) = RunConfig::from_toml(&text) {
+        if config.run.initial_weights.is_empty() {
+            config.run.initial_weights.clone_from(&own.run.initial_weights);
+            config.run.initial_optimiser = own.run.initial_optimiser;
+        }
+        // With keys that are newer than the checkpoint.
+        text = own.to_toml()?;
+    }
+    let changes = Changes::between(&text, &config.to_toml()?)?;
+    Ok((config, changes))
 }
 
 /// The run whose weights another one begins from: its newest checkpoint.
@@ -137,7 +154,9 @@ impl Parent {
         let run = &mut config.run;
         if !run.initial_weights.is_empty() && run.initial_weights != self.sha256 {
             let (wanted, own) = (&run.initial_weights, &self.sha256);
-            let reason = format!("run.initial_weights is {wanted}, its newest checkpoint has {own}; name another run, or remove the key");
+            let reason = format!(
+                "run.initial_weights is {wanted}, its newest checkpoint has {own}; name another run, or remove the key"
+            );
             return Err(TrainError::Parent(self.folder.clone(), reason));
         }
         run.initial_weights.clone_from(&self.sha256);
@@ -150,8 +169,12 @@ impl Parent {
     pub(crate) fn begin(&self, config: &RunConfig, fresh: &mut Learned) -> Result<(), TrainError> {
         for network in &mut fresh.networks {
             let of = |parent: &&Network| parent.name == network.name && !parent.params.values.is_empty();
-            let Some(parent) = self.learned.networks.iter().find(of).filter(|_| !network.params.values.is_empty()) else {
-                tracing::info!(network = network.name, "not trained in the run that this one begins from: it begins anew");
+            let Some(parent) = self.learned.networks.iter().find(of).filter(|_| !network.params.values.is_empty())
+            else {
+                tracing::info!(
+                    network = network.name,
+                    "not trained in the run that this one begins from: it begins anew"
+                );
                 continue;
             };
             let layout = |network: &Network| {
@@ -181,12 +204,15 @@ impl Parent {
         own: &[(String, Vec<usize>)],
         theirs: &[(String, Vec<usize>)],
     ) -> Result<TrainError, TrainError> {
-        let first = own.iter().find(|entry| !theirs.contains(entry)).or_else(|| theirs.iter().find(|e| !own.contains(e)));
+        let first =
+            own.iter().find(|entry| !theirs.contains(entry)).or_else(|| theirs.iter().find(|e| !own.contains(e)));
         let (name, _) = first.cloned().unwrap_or_default();
         let shape = |list: &[(String, Vec<usize>)]| {
-            list.iter().find(|(other, _)| *other == name).map_or("missing".to_owned(), |(_, shape)| format!("{shape:?}"))
+            list.iter()
+                .find(|(other, _)| *other == name)
+                .map_or("missing".to_owned(), |(_, shape)| format!("{shape:?}"))
         };
-        let changes = Changes::between(&self.config, config)?;
+        let changes = Changes::between(&self.config.to_toml()?, &config.to_toml()?)?;
         let decides = |key: &str| {
             key.starts_with("executor.") || key.starts_with("commander.") || ["task.name", "task.agents"].contains(&key)
         };
@@ -213,15 +239,17 @@ mod tests {
         let own = RunConfig::default();
         let mut other = own.clone();
         (other.run.max_steps, other.run.target_success) = (5, 2.0);
-        let changes = Changes::between(&own, &other).unwrap();
+        let between =
+            |a: &RunConfig, b: &RunConfig| Changes::between(&a.to_toml().unwrap(), &b.to_toml().unwrap()).unwrap();
+        let changes = between(&own, &other);
         assert_eq!(changes.forbidden(), None);
         assert!(changes.has("run.max_steps") && changes.target(), "{changes}");
         (other.run.seed, other.mappo.gamma) = (2, 0.5);
-        let forbidden = Changes::between(&own, &other).unwrap().forbidden().unwrap();
+        let forbidden = between(&own, &other).forbidden().unwrap();
         assert_eq!(forbidden, "mappo.gamma was 0.99 and is 0.5, run.seed was 1 and is 2");
         other = own.clone();
         other.run.keep_checkpoints = 9;
-        assert!(!Changes::between(&own, &other).unwrap().target());
-        assert!(Changes::between(&own, &own).unwrap().is_empty());
+        assert!(!between(&own, &other).target());
+        assert!(between(&own, &own).is_empty());
     }
 }

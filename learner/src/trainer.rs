@@ -18,7 +18,7 @@ use crate::report::records::{IterationMetrics, Summary, Timing};
 use crate::report::tensorboard::EventFile;
 use crate::run_events::{CollectError, RunEvent, parse_report};
 use crate::run_folder::CONFIG_FILE;
-use crate::run_start::{Changes, Parent};
+use crate::run_start::{Changes, Parent, continued};
 use crate::train::batch::Batch;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
@@ -99,26 +99,12 @@ impl Trainer {
         folder: &Path,
         threads: usize,
     ) -> Result<(Self, Vec<CheckpointError>), TrainError> {
-        let mut config = config.clone();
-        let changes = match checkpoint::configuration(folder) {
-            Some(own) => {
-                let own = RunConfig::from_toml(&own)?;
-                if config.run.initial_weights.is_empty() {
-                    config.run.initial_weights.clone_from(&own.run.initial_weights);
-                    config.run.initial_optimiser = own.run.initial_optimiser;
-                }
-                Changes::between(&own, &config)?
-            }
-            None => Changes::default(),
-        };
+        let (config, changes) = continued(folder, config)?;
         if let Some(forbidden) = changes.forbidden() {
             return Err(TrainError::OtherConfiguration(folder.to_owned(), forbidden));
         }
         let mut trainer = Self::prepare(&config, RunId(String::new()), folder, threads)?;
         let (mut progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
-        if changes.is_empty() && progress.config_sha256 != trainer.progress.config_sha256 {
-            return Err(TrainError::OtherConfiguration(folder.to_owned(), "its configuration was edited".to_owned()));
-        }
         trainer.run_id = RunId(progress.run_id.clone());
         checkpoint::clean(folder);
         if changes.is_empty() {
@@ -159,7 +145,9 @@ impl Trainer {
         };
         // In this order: a kill in between leaves a run that is not complete.
         match std::fs::remove_file(self.folder.join(SUMMARY_FILE)) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(failed(SUMMARY_FILE)(error).into()),
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(failed(SUMMARY_FILE)(error).into());
+            }
             _ => {}
         }
         let toml = self.progress.config.as_bytes();
@@ -288,10 +276,7 @@ impl Trainer {
             let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
             self.record(collector, &episodes, evaluation, timing, Some(updates))?;
 
-            // A checkpoint would make a folder without the files of a run.
-            if identity(&self.folder) != self.place {
-                return Err(TrainError::Gone(self.folder.clone()));
-            }
+            self.is_there()?;
             let clock = Instant::now();
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
@@ -398,6 +383,11 @@ impl Trainer {
         Ok(())
     }
 
+    /// A checkpoint in a folder that was removed would make one without the other files of a run.
+    fn is_there(&self) -> Result<(), TrainError> {
+        if identity(&self.folder) == self.place { Ok(()) } else { Err(TrainError::Gone(self.folder.clone())) }
+    }
+
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }
@@ -471,7 +461,7 @@ fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
                 threads /= 2;
                 tracing::warn!(%error, threads, "not all training threads can be started; trying with fewer");
             }
-            built => return Ok(built?),
+            built => return built.map_err(|error| TrainError::Threads(error.to_string())),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Signals of terminals, supervisors and batch systems: each ends a training with a checkpoint and code 75, and none counts
 //! twice. Limits of resources that would kill a process.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use magex_core::config::ExecutorKind;
 use magex_tests::sandbox::{Process, binary, wait_until};
@@ -38,12 +38,14 @@ impl Place {
         command.stderr(fs::File::create(self.path(&format!("{run}.log"))).unwrap()).spawn().unwrap()
     }
 
-    /// Runs a shell's line with `ulimit`; `@` is this folder, `magex` the program.
-    fn limited(&self, line: &str) -> (Option<i32>, String) {
-        let line = line.replace('@', &self.0.path().display().to_string());
-        let line = line.replace("magex ", &format!("exec {} ", binary().display()));
-        let output = Command::new("bash").args(["-c", &line]).stdin(Stdio::null()).output().unwrap();
-        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    /// A training in one process within these limits, and its log.
+    fn limited(&self, limits: &str, arguments: &str) -> (Child, PathBuf) {
+        let log = self.path("limited.log");
+        let line = format!("{limits}; exec {} {arguments} --in-process --http off", binary().display());
+        let mut command = Command::new("bash");
+        command.args(["-c", &line.replace('@', &self.0.path().display().to_string())]);
+        let child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(fs::File::create(&log).unwrap()).spawn();
+        (child.unwrap(), log)
     }
 }
 
@@ -99,7 +101,8 @@ fn a_closing_terminal_leaves_a_training_alone_that_nohup_started() {
     let line = format!("nohup {} train --http off @/given.toml --in-process --out @/run", binary().display());
     let line = line.replace('@', &place.0.path().display().to_string());
     let words: Vec<&str> = line.split(' ').collect();
-    let mut training = Command::new(words[0]).args(&words[1..]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let mut training =
+        Command::new(words[0]).args(&words[1..]).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     wait_until("iterations", || place.lines("run") > 1);
     send("HUP", &training.id().to_string());
     let before = place.lines("run");
@@ -112,18 +115,59 @@ fn a_closing_terminal_leaves_a_training_alone_that_nohup_started() {
 fn a_limit_of_file_size_is_a_full_disk() {
     let place = Place::new(30);
     // Too small for the first checkpoint: the end, at once, with the limit, and nothing left behind.
-    let (code, log) = place.limited("ulimit -f 4; magex train @/given.toml --out @/small --in-process --http off");
-    assert_eq!(code, Some(73), "{log}");
-    assert!(log.contains("limit of file size") && log.contains("4 KiB") && log.contains("ulimit -f"), "{log}");
+    let (mut training, log) = place.limited("ulimit -f 4", "train @/given.toml --out @/small");
+    let code = training.wait().unwrap().code();
+    let text = fs::read_to_string(log).unwrap();
+    assert_eq!(code, Some(73), "{text}");
+    assert!(text.contains("limit of file size is 4 KiB (ulimit -f)"), "{text}");
     assert!(!place.path("small").exists());
     // Large enough for that, too small for metrics.jsonl: it trains, says what is missing, and continues when there is room.
-    let mut config = fs::read_to_string(place.path("given.toml")).unwrap();
-    config = config.replace("hidden = 32\nn", "hidden = 8\nn");
+    let config = fs::read_to_string(place.path("given.toml")).unwrap().replace("hidden = 32\nn", "hidden = 8\nn");
     fs::write(place.path("given.toml"), config).unwrap();
-    let line = "ulimit -f 24; timeout -s TERM 20 magex train @/given.toml --out @/run --in-process --http off";
-    let (_, log) = place.limited(&line.replace("timeout -s TERM 20 magex", &format!("exec timeout -s TERM 20 {}", binary().display())));
-    assert!(log.contains("metrics.jsonl cannot be written") && log.contains("limit of file size"), "{log}");
-    let (code, log) = place.limited("magex train --resume --out @/run --in-process --http off");
-    assert_eq!(code, Some(0), "{log}");
+    let (mut training, log) = place.limited("ulimit -f 24", "train @/given.toml --out @/run");
+    let text = || fs::read_to_string(&log).unwrap();
+    let told = ["metrics.jsonl cannot be written", "limit of file size is 24 KiB"];
+    wait_until("the limit to be named", || told.iter().all(|words| text().contains(words)));
+    send("TERM", &training.id().to_string());
+    assert_eq!(training.wait().unwrap().code(), Some(75), "{}", text());
+    let (mut training, _) = place.limited("true", "train --resume --out @/run");
+    assert!(training.wait().unwrap().success(), "{}", text());
     assert_eq!(place.lines("run"), 31);
+}
+
+#[test]
+fn few_open_files_are_enough_for_a_training_or_named_at_the_start() {
+    let place = Place::new(3);
+    let out = place.path("run").display().to_string();
+    let line = |limit: u32| {
+        let (program, given) = (binary().display(), place.path("given.toml"));
+        let line = format!("ulimit -n {limit}; exec {program} train {} --out {out} --http off", given.display());
+        Command::new("bash").args(["-c", &line]).stdin(Stdio::null()).output().unwrap()
+    };
+    let refused = line(24);
+    let text = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(64), "{text}");
+    assert!(text.contains("open files is 24 (ulimit -n); 32 are needed"), "{text}");
+    assert!(!place.path("run").exists());
+    for limit in [32, 64, 128] {
+        let trained = line(limit);
+        assert!(trained.status.success(), "{limit}: {}", String::from_utf8_lossy(&trained.stderr));
+        fs::remove_dir_all(&out).unwrap();
+    }
+}
+
+#[test]
+fn a_run_folder_that_is_removed_ends_the_training_by_name() {
+    for how in ["--in-process", "--actors=1"] {
+        let place = Place::new(1_000_000);
+        let mut training = place.train("run", how);
+        wait_until("iterations", || place.lines("run") > 1);
+        // A kill may hit it between two files.
+        wait_until("the folder to be removed", || fs::remove_dir_all(place.path("run")).is_ok());
+        let code = training.wait().unwrap().code();
+        let log = fs::read_to_string(place.path("run.log")).unwrap();
+        assert_eq!(code, Some(73), "{how}: {log}");
+        assert!(log.contains("/run: the run folder was removed"), "{how}: {log}");
+        assert!(!place.path("run").exists(), "{how}");
+    }
 }

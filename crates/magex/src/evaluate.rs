@@ -3,14 +3,14 @@
 use crate::failure::usage;
 use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
+use crate::logging::set_live_line;
+use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
-use crate::logging::set_live_line;
-use indicatif::{ProgressBar, ProgressStyle};
 use magex_runtime::sync::lock;
 use std::path::PathBuf;
 use std::sync::Mutex;

@@ -88,9 +88,6 @@ impl Collector for LocalCollector {
     }
 
     fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError> {
-        if let Some(reason) = self.stop_requested() {
-            return Err(CollectError::Stopped(reason));
-        }
         match &self.policy {
             Some(policy) => policy.rollout_all(&plan, self.threads, |_| {}),
             None => Err(CollectError::NoWeights),

@@ -41,7 +41,10 @@ pub fn require(files: usize, threads: usize) -> Result<(), Failure> {
             let wait = || drop(crate::sync::lock(&gate));
             let thread = std::thread::Builder::new().stack_size(64 << 10).spawn_scoped(scope, wait);
             if let Err(error) = thread {
-                return Err(no_thread(&error, &format!("of the {threads} threads that are needed, {started} can be started")));
+                return Err(no_thread(
+                    &error,
+                    &format!("of the {threads} threads that are needed, {started} can be started"),
+                ));
             }
             started += 1;
         }

@@ -58,7 +58,9 @@ fn watch(requests: impl Iterator<Item = Request>) -> std::io::Result<Cancellatio
     let (sender, received) = mpsc::channel(8);
     for (kind, name, insists) in requests {
         let (mut signals, sender) = (signal(kind)?, sender.clone());
-        tokio::spawn(async move { while signals.recv().await.is_some() && sender.send((name, insists)).await.is_ok() {} });
+        tokio::spawn(
+            async move { while signals.recv().await.is_some() && sender.send((name, insists)).await.is_ok() {} },
+        );
     }
     let token = CancellationToken::new();
     tokio::spawn(obey(received, token.clone(), || std::process::exit(i32::from(crate::exit::INTERRUPTED))));

@@ -47,6 +47,10 @@ impl MetricsFile {
         let text = String::from_utf8_lossy(&bytes);
         // By number: each iteration is there once and in order, whatever wrote to the file.
         let lines: BTreeMap<u64, &str> = text.lines().filter_map(|line| Some((trained(line)?, line))).collect();
+        let missing = u64::from(iteration).saturating_sub(lines.len() as u64);
+        if missing > 0 {
+            tracing::warn!(missing, path = %path.display(), "lines of earlier iterations are missing");
+        }
         let kept: String = lines.values().flat_map(|line| [*line, "\n"]).collect();
         // Truncation works on a full disk, so a full disk does not keep a run from resuming.
         if bytes.starts_with(kept.as_bytes()) && path.exists() {

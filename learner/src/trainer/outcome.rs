@@ -48,7 +48,9 @@ pub enum TrainError {
     )]
     OtherConfiguration(PathBuf, String),
     /// A budget that is spent already.
-    #[error("run.max_steps: the run has trained {done} steps, so its budget cannot be lowered to {requested}; give {done} or more")]
+    #[error(
+        "run.max_steps: the run has trained {done} steps, so its budget cannot be lowered to {requested}; give {done} or more"
+    )]
     Budget {
         /// As it was requested.
         requested: u64,
@@ -59,7 +61,9 @@ pub enum TrainError {
     #[error("--from {}: {}", .0.display(), .1)]
     Parent(PathBuf, String),
     /// The configuration names weights to begin from, and nothing says where they are.
-    #[error("run.initial_weights: the run begins from the weights {0}; name their run with --from RUN, or remove the key")]
+    #[error(
+        "run.initial_weights: the run begins from the weights {0}; name their run with --from RUN, or remove the key"
+    )]
     NoParent(String),
     /// The run folder was removed or replaced while the run went on.
     #[error(
@@ -71,8 +75,8 @@ pub enum TrainError {
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The training threads could not be started.
-    #[error("training threads: {}; {}", .0, magex_runtime::limits::threads())]
-    Threads(#[from] rayon::ThreadPoolBuildError),
+    #[error("training threads cannot be started ({}); {}", .0, magex_runtime::limits::threads())]
+    Threads(String),
 }
 
 impl TrainError {

@@ -35,19 +35,24 @@ Examples:
   magex train --executor local --seed 2    the small network, another seed
   magex train my.toml --out runs/mine      a configuration of your own
   magex train --resume --out runs/mine     continue after Ctrl-C or a crash
+  magex train --resume --out runs/mine --max-steps 50000    train on
+  magex train new.toml --from runs/mine    begin from the weights of a run
   magex train --in-process --json          one process; result as JSON
   magex train --http 127.0.0.1:8080        fixed port for the live page
 
 The run folder gets config.toml, metrics.jsonl, checkpoints/,
-weights.safetensors, summary.json, curve.svg, replay.html and tensorboard/.
+weights.safetensors, summary.json, recordings.json, curve.svg, replay.html,
+tensorboard/, logs/ and .lock; README.md explains each.
 The address of the live page is printed at the start. The same configuration
 and seed give the same weights, in one process or with any number of actors.
 The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to
-resume; a second Ctrl-C stops at once.
+resume; a second Ctrl-C, half a second later or more, stops at once. SIGTERM,
+SIGUSR1 and SIGHUP are like the first Ctrl-C.
 
 Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-73 --out exists or cannot be written, 75 stopped before the end (--resume
-continues), 130 interrupted twice";
+69 the port of the page is in use, 73 --out exists, cannot be written or is
+written by another process, 75 stopped before the end (--resume continues),
+130 interrupted twice";
 
 /// Threads of this process besides those that train.
 const OWN_THREADS: usize = 4;
@@ -65,7 +70,8 @@ pub(crate) struct TrainArgs {
     /// Run folder [default: runs/<task>-<N>-<executor>-s<seed>, with -2, -3, … if it exists].
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Continue the run in --out from its newest usable checkpoint.
+    /// Continue the run in --out from its newest usable checkpoint; keys of [run] may change (budget, target, evaluations,
+    /// checkpoints).
     #[arg(long, requires = "out")]
     resume: bool,
     /// Begin from the weights of another run: its newest checkpoint. Team size, rewards and step sizes may differ; without a
@@ -187,9 +193,7 @@ fn prepare(args: &TrainArgs, config: RunConfig, parent: Option<Parent>) -> anyho
     let out = args.out.as_deref();
     let resumed = out.filter(|folder| args.resume && RunFolderState::of(folder) != RunFolderState::Begun);
     let (folder, claim) = match resumed {
-        Some(folder) => {
-            (folder.to_owned(), Claim::resume(folder, COMMAND, None).map_err(folder::refused)?)
-        }
+        Some(folder) => (folder.to_owned(), Claim::resume(folder, COMMAND, None).map_err(folder::refused)?),
         None => {
             let (name, toml) = (folder::default_name(&config), config.to_toml()?);
             folder::begin(out, &name, &toml, COMMAND, args.resume).map_err(folder::refused)?
@@ -257,7 +261,10 @@ fn train_in_process(
     interrupted: CancellationToken,
     progress: &mut Progress,
 ) -> anyhow::Result<TrainEnd> {
-    let stop = Arc::new(AtomicBool::new(interrupted.is_cancelled()));
+    if interrupted.is_cancelled() {
+        return Ok(TrainEnd::Stopped);
+    }
+    let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
     let told = plan.claim.clone();
     runtime.spawn(async move {

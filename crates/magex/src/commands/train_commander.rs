@@ -286,7 +286,9 @@ mod tests {
             std::fs::create_dir_all(&out).unwrap();
             std::fs::write(out.join(folder::CONFIG), config.to_toml().unwrap()).unwrap();
             let ppo = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-            Training { stop: CancellationToken::new(), config, ppo, args, threads, out: out.clone() }.run(Output::new(true)).unwrap();
+            Training { stop: CancellationToken::new(), config, ppo, args, threads, out: out.clone() }
+                .run(Output::new(true))
+                .unwrap();
             let loaded = folder::load(&out, None).unwrap();
             assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
             crate::local::commander(&loaded.config, &loaded.weights, None).unwrap();

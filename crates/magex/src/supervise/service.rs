@@ -189,7 +189,9 @@ impl Running {
         match (status.signal(), limits::memory()) {
             (Some(9), Some((limit, name))) => {
                 let limit = limit >> 20;
-                format!("killed by signal 9, as the system does when memory runs out; the limit is {limit} MiB ({name})")
+                format!(
+                    "killed by signal 9, as the system does when memory runs out; the limit is {limit} MiB ({name})"
+                )
             }
             (Some(6), _) => format!("aborted: {}", line.unwrap_or_default()),
             (Some(signal), _) => format!("killed by signal {signal}"),
