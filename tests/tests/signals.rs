@@ -112,6 +112,22 @@ fn a_closing_terminal_leaves_a_training_alone_that_nohup_started() {
 }
 
 #[test]
+fn a_log_that_nothing_reads_any_more_stops_no_training() {
+    for how in ["--in-process", "--actors=1"] {
+        let place = Place::new(1_000_000);
+        let mut command = Command::new(binary());
+        command.args(["train", "--http", "off", how]).arg(place.path("given.toml")).arg("--out").arg(place.path("run"));
+        let mut training = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        // As when the terminal closes: writing fails from here on.
+        drop(training.stderr.take());
+        wait_until("iterations", || place.lines("run") > 20);
+        send("HUP", &training.id().to_string());
+        assert_eq!(training.wait().unwrap().code(), Some(75), "{how}");
+        assert!(newest(&place.path("run")) > 0, "{how}");
+    }
+}
+
+#[test]
 fn a_limit_of_file_size_is_a_full_disk() {
     let place = Place::new(30);
     // Too small for the first checkpoint: the end, at once, with the limit, and nothing left behind.

@@ -71,8 +71,8 @@ async fn obey(mut signals: mpsc::Receiver<(&'static str, bool)>, token: Cancella
     let mut insisted: Option<Instant> = None;
     while let Some((name, insists)) = signals.recv().await {
         if !token.is_cancelled() {
-            tracing::info!(signal = name, "stopping; a second SIGINT or SIGTERM stops at once");
             token.cancel();
+            tracing::info!(signal = name, "stopping; a second SIGINT or SIGTERM stops at once");
         }
         match insisted {
             None if insists => insisted = Some(Instant::now()),
