@@ -85,6 +85,9 @@ pub struct Progress {
     pub run_id: String,
     /// Fingerprint of the effective configuration.
     pub config_sha256: String,
+    /// The effective configuration, TOML; empty in older checkpoints.
+    #[serde(default)]
+    pub config: String,
     /// Iterations completed.
     pub iteration: u32,
     /// Joint environment steps trained on.
@@ -292,6 +295,21 @@ pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
         // Any other number may be a flipped bit: `read` tells damage from another format.
         _ => Ok(()),
     }
+}
+
+/// The configuration that the newest undamaged checkpoint was made with, whatever its networks look like.
+pub fn configuration(run: &Path) -> Option<String> {
+    #[derive(Deserialize)]
+    struct Counters {
+        progress: Progress,
+    }
+    let read = |folder: &PathBuf| {
+        let (manifest, state) = (fs::read(folder.join(MANIFEST)).ok()?, fs::read(folder.join("state.json")).ok()?);
+        let manifest: Manifest = serde_json::from_slice(&manifest).ok()?;
+        let whole = manifest.sha256.get("state.json") == Some(&sha256::hex(&state));
+        serde_json::from_slice::<Counters>(&state).ok().filter(|_| whole)
+    };
+    list(run).iter().rev().find_map(read).map(|state| state.progress.config).filter(|config| !config.is_empty())
 }
 
 /// The newest checkpoint that can be read, and what was wrong with the newer ones. One of another format is not damage: what

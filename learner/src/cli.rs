@@ -1,12 +1,12 @@
 //! The learner's command line.
 
 use crate::checkpoint;
-use crate::checkpoint::disk::{FileSystem, replace_file};
-use crate::run_folder::{CONFIG_FILE, RunFolderState};
+use crate::run_folder::{CONFIG_FILE, Claim, FolderError, RunFolderState};
 use crate::run_identity::RunIdentity;
+use crate::run_start::Parent;
 use crate::serve::service::learner_service;
 use crate::serve::validate::Limits;
-use crate::trainer::{TrainOutcome, Trainer, max_shard_episodes};
+use crate::trainer::{TrainError, TrainOutcome, Trainer, max_shard_episodes};
 use clap::Args;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
@@ -14,12 +14,13 @@ use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
+use magex_runtime::limits;
 use magex_runtime::process;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
 use magex_viewer::page::{LivePage, RunInfo};
 use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -48,6 +49,12 @@ pub struct LearnerArgs {
     /// Continue the run in that folder if there is one, begin it otherwise: for supervisors that repeat the same command
     #[arg(long, env = "MAGEX_RESUME_OR_CREATE", conflicts_with = "resume")]
     pub resume_or_create: bool,
+    /// Begin a new run from the weights of another one: its newest checkpoint
+    #[arg(long, env = "MAGEX_FROM", value_name = "RUN")]
+    pub from: Option<PathBuf>,
+    /// With --from: begin with the state of its optimiser, too
+    #[arg(long, env = "MAGEX_KEEP_OPTIMISER", requires = "from")]
+    pub keep_optimiser: bool,
     /// Continue serving after the run is complete, until shutdown
     #[arg(long, env = "MAGEX_LEARNER_STAY")]
     pub stay: bool,
@@ -63,18 +70,28 @@ pub struct LearnerArgs {
     /// Training threads [default: one per processor]
     #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
     pub threads: usize,
+    /// Descriptor of the run folder's lock, which the supervisor of this process holds
+    #[arg(long, hide = true)]
+    pub lock_descriptor: Option<i32>,
     /// Options of every service
     #[command(flatten)]
     pub service: ServiceArgs,
 }
+
+/// The name of this process in the lock of a run folder.
+const COMMAND: &str = "magex learner";
 
 /// Trains until the run is complete or stopped. Returns the exit code.
 pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
     if args.service.health_check {
         return probe::own(&args.listen, args.security.tls_cert.is_some());
     }
-    args.resume |= args.resume_or_create && RunFolderState::of(&args.out) == RunFolderState::Run;
-    let config = configure(&args)?;
+    let state = RunFolderState::of(&args.out);
+    args.resume |= args.resume_or_create && state == RunFolderState::Run;
+    // A run that has begun knows the weights that it began from.
+    let from = args.from.as_deref().filter(|_| !args.resume || state == RunFolderState::Begun);
+    let parent = from.map(Parent::read).transpose().map_err(failed)?;
+    let config = configure(&args, parent.as_ref())?;
     let toml = config.to_toml().map_err(Failure::usage)?;
     if args.service.print_config {
         process::print(&toml);
@@ -85,7 +102,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     let security = args.security.read(&args.listen)?;
-    let run = async |context: Context| train(context, &args, config, toml, lease, security).await;
+    let run = async |context: Context| train(context, &args, config, toml, parent, lease, security).await;
     let reason = match service::main("learner", 2, &args.service, run)? {
         Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
         Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
@@ -101,13 +118,20 @@ async fn train(
     args: &LearnerArgs,
     config: RunConfig,
     toml: String,
+    parent: Option<Parent>,
     lease: Duration,
     security: Security,
 ) -> Result<Option<TrainOutcome>, Failure> {
     // Bound first: a port that is not available must not leave a run folder behind.
     let (incoming, address) = context.listen(&args.listen, args.security.connections()).await?;
     let stop = context.stop.clone();
-    let mut trainer = prepare(args, &config, &toml)?;
+    let (claim, mut trainer) = prepare(args, &config, &toml, parent.as_ref())?;
+    let claim = Arc::new(claim);
+    let (stopped, claimed, begun) = (stop.clone(), claim.clone(), claim.clone());
+    tokio::spawn(async move {
+        stopped.cancelled().await;
+        claimed.lock.stopping();
+    });
     let identity = RunIdentity {
         run_id: trainer.run_id().clone(),
         name: args.out.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
@@ -140,8 +164,13 @@ async fn train(
         .spawn(move || {
             // The receiver is gone when the process shuts down.
             let _ = ended.send(trainer.run(&mut collector));
+            // The folder stays locked while this thread may write to it.
+            drop(claim);
         })
-        .map_err(|error| Failure::new(exit::INTERNAL, error))?;
+        .map_err(|error| {
+            begun.abandon();
+            limits::no_thread(&error, "the training thread cannot be started")
+        })?;
     let outcome = tokio::select! {
         outcome = training_end => Some(outcome),
         () = async { stop.cancelled().await; tokio::time::sleep(STOP_BUDGET).await } => None,
@@ -166,7 +195,7 @@ async fn train(
     log_ledger(&handle.status());
     let Some(outcome) = outcome else { return Ok(None) };
     let panicked = |_| Failure::new(exit::INTERNAL, "the training thread panicked; its message is in the log above");
-    outcome.map_err(panicked)?.map(Some).map_err(|error| Failure::new(exit::FAILURE, error))
+    outcome.map_err(panicked)?.map(Some).map_err(failed)
 }
 
 fn log_ledger(status: &v1::RunStatus) {
@@ -187,52 +216,63 @@ fn log_ledger(status: &v1::RunStatus) {
     }
 }
 
-/// The configuration in effect: flags over environment over file; when resuming, the run's own file.
-fn configure(args: &LearnerArgs) -> Result<RunConfig, Failure> {
+/// The configuration in effect: flags over environment over file; without a file the run's own, or that of the run whose weights
+/// it begins from.
+fn configure(args: &LearnerArgs, parent: Option<&Parent>) -> Result<RunConfig, Failure> {
     if args.resume {
         checkpoint::check_format(&args.out).map_err(Failure::usage)?;
     }
     let own = || args.resume.then(|| args.out.join(CONFIG_FILE));
-    let mut config = match args.config.clone().or_else(own) {
-        Some(path) => {
+    let mut config = match (args.config.clone().or_else(own), parent) {
+        (Some(path), _) => {
             let named = |error: &dyn Display| Failure::usage(format!("{}: {error}", path.display()));
             let text = std::fs::read_to_string(&path).map_err(|error| named(&error))?;
             RunConfig::from_toml(&text).map_err(|error| named(&error))?
         }
-        None => RunConfig::from_toml("").map_err(Failure::usage)?,
+        (None, Some(parent)) => parent.config(),
+        (None, None) => RunConfig::from_toml("").map_err(Failure::usage)?,
     };
     if let Some(seed) = args.seed {
         config.run.seed = seed;
     }
-    Ok(config)
+    match parent {
+        Some(parent) => parent.recorded(config, args.keep_optimiser).map_err(failed),
+        None => Ok(config),
+    }
 }
 
-fn prepare(args: &LearnerArgs, config: &RunConfig, toml: &str) -> Result<Trainer, Failure> {
-    let failed = |error: &dyn Display| Failure::new(exit::FAILURE, error);
-    if args.resume {
-        let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads).map_err(|error| failed(&error))?;
+fn failed(error: TrainError) -> Failure {
+    let code = match &error {
+        error if error.is_usage() => exit::USAGE,
+        TrainError::Gone(_) => exit::CANNOT_CREATE,
+        _ => exit::FAILURE,
+    };
+    Failure::new(code, error)
+}
+
+/// Locks the run folder, and creates the run or opens its newest usable checkpoint.
+fn prepare(
+    args: &LearnerArgs,
+    config: &RunConfig,
+    toml: &str,
+    parent: Option<&Parent>,
+) -> Result<(Claim, Trainer), Failure> {
+    let unusable = |error: FolderError| Failure::new(exit::CANNOT_CREATE, format!("--out {error}"));
+    if args.resume && RunFolderState::of(&args.out) != RunFolderState::Begun {
+        let claim = Claim::resume(&args.out, COMMAND, args.lock_descriptor).map_err(unusable)?;
+        let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads).map_err(failed)?;
         for problem in skipped {
             tracing::warn!(error = %problem, "skipped a checkpoint");
         }
-        return Ok(trainer);
+        return Ok((claim, trainer));
     }
-    create_folder(&args.out, toml, args.resume_or_create)?;
+    let claim = Claim::begin(&args.out, toml, COMMAND, args.resume || args.resume_or_create).map_err(unusable)?;
     let run_id = RunId(format!("{:016x}", random_id()));
-    Trainer::create(config, run_id, &args.out, args.threads).map_err(|error| failed(&error))
-}
-
-/// Creates the folder of a new run; the folder of another run is never changed. With `again`, a run that ended before its first
-/// checkpoint begins again.
-fn create_folder(out: &Path, toml: &str, again: bool) -> Result<(), Failure> {
-    let named = |error: &dyn Display| Failure::new(exit::CANNOT_CREATE, format!("{}: {error}", out.display()));
-    match RunFolderState::of(out) {
-        RunFolderState::Empty => {}
-        RunFolderState::Begun if again => tracing::info!("nothing has been trained in this folder; beginning again"),
-        RunFolderState::Other if again => {
-            return Err(named(&"is not a run folder, or its checkpoints are missing; choose another --out"));
+    match Trainer::create_from(parent, config, run_id, &args.out, args.threads) {
+        Ok(trainer) => Ok((claim, trainer)),
+        Err(error) => {
+            claim.abandon();
+            Err(if error.is_output() { Failure::new(exit::CANNOT_CREATE, error) } else { failed(error) })
         }
-        _ => return Err(named(&"exists already; continue a run with --resume, or choose another --out")),
     }
-    std::fs::create_dir_all(out).map_err(|error| named(&error))?;
-    replace_file(&mut FileSystem, out, CONFIG_FILE, toml.as_bytes()).map_err(|error| named(&error))
 }

@@ -9,6 +9,8 @@
 //! | [`collector`] | the seam between the training loop and the actors |
 //! | [`run_events`], [`run_identity`] | what a run reports, and how it is identified |
 //! | [`checkpoint`] | what a resume needs |
+//! | [`run_folder`], [`run_lock`] | beginning and continuing a run in a folder, and the lock that keeps other processes out |
+//! | [`run_start`] | what may change when a run continues, and a run that begins from the weights of another |
 //! | [`cli`] | the command line of `magex-learner` |
 
 pub mod checkpoint;
@@ -18,8 +20,10 @@ pub mod collector;
 mod fixtures;
 pub mod report;
 pub mod run_events;
-mod run_folder;
+pub mod run_folder;
 pub mod run_identity;
+pub mod run_lock;
+pub mod run_start;
 pub mod serve;
 pub mod train;
 pub mod trainer;

@@ -8,14 +8,17 @@ mod saving;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
+use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::checkpoint::{self, CheckpointError, Progress};
 use crate::collector::Collector;
 use crate::report::means::{ClosingMeans, EvalSummary, IterationMeans, summarise};
 use crate::report::metrics_file::MetricsFile;
-use crate::report::observer::{RunObserver, RunStart};
+use crate::report::observer::{FileError, RunObserver, RunStart};
 use crate::report::records::{IterationMetrics, Summary, Timing};
 use crate::report::tensorboard::EventFile;
 use crate::run_events::{CollectError, RunEvent, parse_report};
+use crate::run_folder::CONFIG_FILE;
+use crate::run_start::{Changes, Parent, continued};
 use crate::train::batch::Batch;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
@@ -30,6 +33,7 @@ use magex_proto::v1::{FinishedEvent, IterationEvent};
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
 use magex_viewer::page::{Phase, RunEnd};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -37,12 +41,16 @@ use std::time::Instant;
 /// Evaluations in a row that must reach the target.
 const EVALUATIONS_ON_TARGET: u32 = 2;
 
+const SUMMARY_FILE: &str = "summary.json";
+
 /// One run.
 #[derive(Debug)]
 pub struct Trainer {
     config: RunConfig,
     run_id: RunId,
     folder: PathBuf,
+    /// Which folder that was at the start.
+    place: Option<(u64, u64)>,
     mappo: Mappo,
     commander: CommanderPpo,
     learned: Learned,
@@ -64,7 +72,23 @@ impl Trainer {
     /// # Errors
     /// A configuration that its task or networks reject; a folder that cannot be written.
     pub fn create(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
+        Self::create_from(None, config, run_id, folder, threads)
+    }
+
+    /// The same, from the weights that the configuration names, if it names any: those of `parent`.
+    pub fn create_from(
+        parent: Option<&Parent>,
+        config: &RunConfig,
+        run_id: RunId,
+        folder: &Path,
+        threads: usize,
+    ) -> Result<Self, TrainError> {
         let mut trainer = Self::prepare(config, run_id, folder, threads)?;
+        match parent {
+            Some(parent) => parent.begin(config, &mut trainer.learned)?,
+            None if config.run.initial_weights.is_empty() => {}
+            None => return Err(TrainError::NoParent(config.run.initial_weights.clone())),
+        }
         trainer.observe(MetricsFile::create(folder)?);
         trainer.observe(EventFile::new(folder, None));
         trainer.checkpoint()?;
@@ -72,7 +96,7 @@ impl Trainer {
     }
 
     /// A run that continues from its newest usable checkpoint; the errors of newer ones are returned. A complete run is not
-    /// changed.
+    /// changed, unless the configuration is: keys of `[run]` may change, and a larger budget continues it.
     ///
     /// # Errors
     /// No usable checkpoint; one of another configuration or format; metrics.jsonl that cannot be read.
@@ -81,14 +105,19 @@ impl Trainer {
         folder: &Path,
         threads: usize,
     ) -> Result<(Self, Vec<CheckpointError>), TrainError> {
-        let mut trainer = Self::prepare(config, RunId(String::new()), folder, threads)?;
-        let (progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
-        if progress.config_sha256 != trainer.progress.config_sha256 {
-            return Err(TrainError::OtherConfiguration(folder.to_owned()));
+        let (config, changes) = continued(folder, config)?;
+        if let Some(forbidden) = changes.forbidden() {
+            return Err(TrainError::OtherConfiguration(folder.to_owned(), forbidden));
         }
+        let mut trainer = Self::prepare(&config, RunId(String::new()), folder, threads)?;
+        let (mut progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
         trainer.run_id = RunId(progress.run_id.clone());
         checkpoint::clean(folder);
-        trainer.complete = summary_of(folder, progress.iteration, &learned)?;
+        if changes.is_empty() {
+            trainer.complete = summary_of(folder, progress.iteration, &learned)?;
+        } else {
+            trainer.change(&changes, &mut progress)?;
+        }
         if trainer.complete.is_none() {
             trainer.observe(MetricsFile::reopen(folder, progress.iteration)?);
             trainer.observe(EventFile::new(folder, Some(progress.joint_env_steps)));
@@ -99,19 +128,49 @@ impl Trainer {
         Ok((trainer, skipped))
     }
 
+    /// Continues with a changed configuration: the end of an earlier one is not the end any more.
+    fn change(&self, changes: &Changes, progress: &mut Progress) -> Result<(), TrainError> {
+        let (requested, done) = (self.config.run.max_steps, progress.joint_env_steps);
+        if self.config.max_iterations() < progress.iteration {
+            return Err(TrainError::Budget { requested, done });
+        }
+        tracing::info!(%changes, "continuing with a changed configuration");
+        if changes.has("run.max_steps") && self.config.mappo.linear_decay {
+            tracing::warn!(
+                "mappo.linear_decay: step sizes fall to zero over the new budget from here on; the weights will differ from \
+                 those of a run that began with it"
+            );
+        }
+        if changes.target() {
+            progress.on_target = 0;
+        }
+        (progress.config_sha256, progress.config) = (self.progress.config_sha256.clone(), self.progress.config.clone());
+        let failed = |name: &str| {
+            let path = self.folder.join(name);
+            move |error| FileError { path, error }
+        };
+        // In this order: a kill in between leaves a run that is not complete.
+        match std::fs::remove_file(self.folder.join(SUMMARY_FILE)) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(failed(SUMMARY_FILE)(error).into());
+            }
+            _ => {}
+        }
+        let toml = self.progress.config.as_bytes();
+        Ok(replace_file(&mut FileSystem, &self.folder, CONFIG_FILE, toml).map_err(failed(CONFIG_FILE))?)
+    }
+
     fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
         let mappo = Mappo::new(config)?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
         let learned = Learned::init(&mappo, &commander)?;
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.max(1))
-            .thread_name(|i| format!("magex-train-{i}"))
-            .stack_size(64 << 20)
-            .build()?;
+        let pool = pool(threads.max(1))?;
+        let toml = config.to_toml()?;
         let progress = Progress {
             run_id: run_id.0.clone(),
-            config_sha256: sha256::hex(config.to_toml()?.as_bytes()),
+            config_sha256: sha256::hex(toml.as_bytes()),
+            config: toml,
             iteration: 0,
             joint_env_steps: 0,
             on_target: 0,
@@ -121,6 +180,7 @@ impl Trainer {
             config: config.clone(),
             run_id,
             folder: folder.to_owned(),
+            place: identity(folder),
             mappo,
             commander,
             learned,
@@ -225,6 +285,7 @@ impl Trainer {
             let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
             self.record(collector, &episodes, evaluation, timing, Some(updates))?;
 
+            self.is_there()?;
             let clock = Instant::now();
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
@@ -331,6 +392,11 @@ impl Trainer {
         Ok(())
     }
 
+    /// A checkpoint in a folder that was removed would make one without the other files of a run.
+    fn is_there(&self) -> Result<(), TrainError> {
+        if identity(&self.folder) == self.place { Ok(()) } else { Err(TrainError::Gone(self.folder.clone())) }
+    }
+
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }
@@ -374,7 +440,7 @@ impl Trainer {
         let (line, recordings) = (serde_json::to_string(&summary)?, serde_json::to_vec(&recordings)?);
         // The summary is written last: a reader that finds it finds the other files too.
         let files: [(&str, &[u8]); 3] =
-            [("weights.safetensors", &weights), ("recordings.json", &recordings), ("summary.json", line.as_bytes())];
+            [("weights.safetensors", &weights), ("recordings.json", &recordings), (SUMMARY_FILE, line.as_bytes())];
         if let Some(reason) = self.write_last_files(collector, &files)? {
             return Ok(TrainOutcome::Stopped(reason));
         }
@@ -385,10 +451,33 @@ impl Trainer {
 
 /// The summary of a complete run: summary.json exists and describes the weights of the checkpoint.
 fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option<(Summary, String)>, TrainError> {
-    let Ok(line) = std::fs::read_to_string(folder.join("summary.json")) else { return Ok(None) };
+    let Ok(line) = std::fs::read_to_string(folder.join(SUMMARY_FILE)) else { return Ok(None) };
     let Ok(summary) = serde_json::from_str::<Summary>(&line) else { return Ok(None) };
     let same = summary.iterations == iteration && summary.weights_sha256 == sha256::hex(&learned.weights()?);
     Ok(same.then_some((summary, line)))
+}
+
+/// Training threads: as many as can be started, up to `most`. Their number changes no number of the run.
+fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
+    let build = |threads| {
+        let builder = rayon::ThreadPoolBuilder::new().num_threads(threads).stack_size(64 << 20);
+        builder.thread_name(|i| format!("magex-train-{i}")).build()
+    };
+    let mut threads = most;
+    loop {
+        match build(threads) {
+            Err(error) if threads > 1 => {
+                threads /= 2;
+                tracing::warn!(%error, threads, "not all training threads can be started; trying with fewer");
+            }
+            built => return built.map_err(|error| TrainError::Threads(error.to_string())),
+        }
+    }
+}
+
+/// Which folder this is, whatever its name.
+fn identity(folder: &Path) -> Option<(u64, u64)> {
+    std::fs::metadata(folder).ok().map(|meta| (meta.dev(), meta.ino()))
 }
 
 /// Training results and evaluations, each in the order of the plan.

@@ -131,7 +131,7 @@ fn a_resume_with_another_configuration_is_refused() {
     let mut other = config.clone();
     other.mappo.gamma = 0.9;
     let error = Trainer::resume(&other, folder.path(), 1).unwrap_err().to_string();
-    assert!(error.contains("another configuration"), "{error}");
+    assert!(error.contains("mappo.gamma was 0.99 and is 0.9"), "{error}");
 }
 
 #[test]

@@ -61,6 +61,10 @@ section! {
         checkpoint_every: u32 = 5, 1..=1_000_000;
         /// Checkpoints kept.
         keep_checkpoints: u32 = 3, 2..=1000;
+        /// SHA-256 of the weights that the run begins from (`--from`); empty if it begins anew.
+        initial_weights: String = String::new();
+        /// Whether the run begins with the optimiser's state of these weights, too (`--keep-optimiser`).
+        initial_optimiser: bool = false;
     }
 }
 

@@ -4,8 +4,10 @@ use crate::failure::cannot_create;
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
+use magex_runtime::limits;
 use magex_viewer::curve::{curve_svg, parse_metrics};
 use magex_viewer::replay::replay_html;
+use rustix::fs::{Access, access};
 use std::path::Path;
 
 /// Task, executor, scheduler and seed of a run on one line.
@@ -53,11 +55,36 @@ pub(crate) fn run_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
 }
 
-/// Writes a file atomically: to a temporary file that is then renamed.
+/// Fails where [`write()`] would: before the work whose result it is to write. The folders that are missing can be made where the
+/// part of the path that exists is a folder that can be written.
+pub(crate) fn check(path: &Path) -> anyhow::Result<()> {
+    let refused = |part: &Path, why: &str| {
+        let part = if part.as_os_str().is_empty() { Path::new(".") } else { part };
+        Err(cannot_create(format!("{}: {} {why}", path.display(), part.display())))
+    };
+    if path.is_dir() {
+        return refused(path, "is a folder; name a file in it");
+    }
+    let Some(there) = path.ancestors().skip(1).find(|part| part.as_os_str().is_empty() || part.exists()) else {
+        return Ok(());
+    };
+    let folder = if there.as_os_str().is_empty() { Path::new(".") } else { there };
+    match access(folder, Access::WRITE_OK | Access::EXEC_OK) {
+        _ if !folder.is_dir() => refused(there, "is not a folder"),
+        Err(error) => refused(there, &format!("cannot be written ({})", std::io::Error::from(error))),
+        Ok(()) => Ok(()),
+    }
+}
+
+/// Writes a file atomically: to a temporary file that is then renamed. Makes the folders above it.
 pub(crate) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let mut temporary = path.as_os_str().to_owned();
     temporary.push(".tmp");
-    std::fs::write(&temporary, bytes)
+    path.parent()
+        .map_or(Ok(()), std::fs::create_dir_all)
+        .and_then(|()| std::fs::write(&temporary, bytes))
         .and_then(|()| std::fs::rename(&temporary, path))
+        .map_err(limits::explained)
+        .inspect_err(|_| drop(std::fs::remove_file(&temporary)))
         .map_err(|error| cannot_create(format!("{}: {error}", path.display())))
 }

@@ -5,7 +5,7 @@ use crate::failure;
 use crate::options::CommonOptions;
 use crate::output::note;
 use clap::{Parser, Subcommand};
-use magex_runtime::exit;
+use magex_runtime::{exit, shutdown};
 use std::process::ExitCode;
 
 const AFTER_HELP: &str = "\
@@ -60,6 +60,7 @@ pub fn main() -> ExitCode {
         }
     };
     let options = cli.options;
+    shutdown::survive_file_size_limit();
     if !matches!(cli.command, Command::Learner(_) | Command::Actor(_) | Command::Commander(_)) {
         // Services set up their own logging.
         options.init_logging();

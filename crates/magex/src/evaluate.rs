@@ -3,13 +3,18 @@
 use crate::failure::usage;
 use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
+use crate::logging::set_live_line;
+use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::Spawn;
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
+use magex_runtime::sync::lock;
 use std::path::PathBuf;
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
 
 /// Evaluation set of `magex eval` unless another is named.
 const EVAL_SET: u32 = 100;
@@ -66,6 +71,9 @@ pub(crate) struct Subject {
     /// Evaluation set: selects the starts; 3 or more.
     #[arg(long, value_name = "SET", default_value_t = EVAL_SET, value_parser = eval_set)]
     pub(crate) eval_set: u32,
+    /// Fail unless the weights are those that a finished run ended with: no checkpoint in place of missing or damaged ones.
+    #[arg(long)]
+    strict: bool,
     #[command(flatten)]
     pub(crate) vary: Variation,
 }
@@ -74,6 +82,10 @@ impl Subject {
     /// Loads the run, with its configuration as it is evaluated.
     pub(crate) fn load(&self) -> anyhow::Result<(Trained, RunConfig)> {
         let trained = folder::load(&self.run, self.config.as_deref())?;
+        if self.strict && !trained.is_final {
+            let notes = trained.notes.join("; ");
+            return Err(anyhow::anyhow!("--strict: these are not the weights of a finished run: {notes}"));
+        }
         trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
         let config = self.vary.apply(&trained)?;
         Ok((trained, config))
@@ -163,6 +175,47 @@ fn eval_set(text: &str) -> Result<u32, String> {
     }
 }
 
+/// Shows how many episodes are done: a line that moves in a terminal, log lines elsewhere.
+struct Waiting {
+    bar: ProgressBar,
+    mode: Mode,
+    /// When the next log line is due.
+    next: Mutex<Instant>,
+}
+
+impl Waiting {
+    const LOG_EVERY: Duration = Duration::from_secs(10);
+
+    fn start(episodes: Episodes) -> Self {
+        // Hidden where standard error is no terminal.
+        let bar = ProgressBar::new(episodes.count.into()).with_message(mode_name(episodes.mode));
+        let template = "{spinner:.cyan} {bar:20.cyan/dim} {human_pos} of {human_len} {msg} episodes · {elapsed}";
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            bar.set_style(style.progress_chars("━━─"));
+        }
+        bar.enable_steady_tick(Duration::from_millis(100));
+        set_live_line(Some(bar.clone()));
+        Self { bar, mode: episodes.mode, next: Mutex::new(Instant::now() + Self::LOG_EVERY) }
+    }
+
+    fn done(&self, episodes: u32) {
+        self.bar.inc(episodes.into());
+        let mut next = lock(&self.next);
+        if self.bar.is_hidden() && Instant::now() >= *next {
+            *next = Instant::now() + Self::LOG_EVERY;
+            let (done, of) = (self.bar.position(), self.bar.length());
+            tracing::info!(done, of, mode = mode_name(self.mode), "episodes");
+        }
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        set_live_line(None);
+        self.bar.finish_and_clear();
+    }
+}
+
 /// Rolls the episodes out: their metrics in order, and the recordings of the first ones.
 pub(crate) fn roll_out(
     policy: &LoadedPolicy,
@@ -172,7 +225,8 @@ pub(crate) fn roll_out(
 ) -> anyhow::Result<(Vec<EpisodeMetrics>, Vec<Recording>)> {
     let plan = plan(episodes, config.task.agents);
     let (mut metrics, mut recordings) = (Vec::new(), Vec::new());
-    for result in policy.rollout_all(&plan, threads)? {
+    let waiting = Waiting::start(episodes);
+    for result in policy.rollout_all(&plan, threads, |shard| waiting.done(shard.episodes))? {
         if let ShardResult::Eval(EvalOutcome { metrics: more, recording, .. }) = result {
             metrics.extend(more);
             recordings.extend(recording);
@@ -236,7 +290,7 @@ mod tests {
     fn trained(toml: &str) -> Trained {
         let config = RunConfig::from_toml(toml).unwrap();
         let (weights, sha256, name) = (Vec::new(), String::new(), String::new());
-        Trained { config, weights, sha256, name, folder: None, notes: Vec::new() }
+        Trained { config, weights, sha256, name, folder: None, notes: Vec::new(), is_final: true }
     }
 
     #[test]

@@ -55,6 +55,7 @@ pub(crate) fn code_of(error: &anyhow::Error) -> u8 {
     }
     match error.downcast_ref::<TrainError>() {
         Some(error) if error.is_usage() => exit::USAGE,
+        Some(TrainError::Gone(_)) => exit::CANNOT_CREATE,
         _ => exit::FAILURE,
     }
 }

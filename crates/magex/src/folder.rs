@@ -7,13 +7,17 @@
 //! | `checkpoints/` | the latest checkpoints, weights as safetensors |
 //! | `weights.safetensors`, `summary.json`, `recordings.json` | the result of a finished run |
 //! | `curve.svg`, `replay.html` | pictures |
+//! | `tensorboard/` | the numbers of metrics.jsonl for TensorBoard |
 //! | `logs/` | standard error of the services |
+//! | `.lock` | locked by the process that writes to the folder |
 
 use crate::failure::{cannot_create, usage};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::sha256;
 use magex_learner::checkpoint::{self, CheckpointError};
+use magex_learner::run_folder::{Claim, FolderError};
+use magex_learner::run_lock::LockError;
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
 use magex_learner::train::mappo::Mappo;
@@ -25,37 +29,42 @@ pub(crate) const SUMMARY: &str = "summary.json";
 /// The trained networks.
 pub const WEIGHTS: &str = "weights.safetensors";
 
-/// `runs/<task>-<N>-<executor>-s<seed>`, or the same with -2, -3, … if it exists.
-pub(crate) fn default_out(config: &RunConfig, exists: impl Fn(&Path) -> bool) -> PathBuf {
+/// `<task>-<N>-<executor>-s<seed>`
+pub(crate) fn default_name(config: &RunConfig) -> String {
     let (task, executor) = (&config.task, config.executor.kind);
-    unused(&format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed), exists)
+    format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed)
 }
 
-/// `runs/<name>`, or the same with -2, -3, … if it exists.
-pub(crate) fn unused(name: &str, exists: impl Fn(&Path) -> bool) -> PathBuf {
-    let first = Path::new("runs").join(name);
-    if !exists(&first) {
-        return first;
+/// Creates and locks the folder of a new run with its configuration: `out`, or `runs/<name>` with -2, -3, … if it is taken. With
+/// `again`, a run in `out` that ended before its first checkpoint begins again.
+pub(crate) fn begin(
+    out: Option<&Path>,
+    name: &str,
+    toml: &str,
+    command: &str,
+    again: bool,
+) -> Result<(PathBuf, Claim), FolderError> {
+    if let Some(out) = out {
+        return Ok((out.to_owned(), Claim::begin(out, toml, command, again)?));
     }
-    (2u32..).map(|k| Path::new("runs").join(format!("{name}-{k}"))).find(|path| !exists(path)).unwrap_or(first)
-}
-
-/// Creates the folder of a new run with its configuration. A folder that is not empty is rejected.
-pub(crate) fn create(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
-    let failed = |error: std::io::Error| cannot_create(format!("--out {}: {error}", folder.display()));
-    if folder.exists() {
-        let empty = folder.is_dir() && std::fs::read_dir(folder).map_err(failed)?.next().is_none();
-        if !empty {
-            let remedy = if folder.join(CONFIG).is_file() {
-                "add --resume to continue the run in it, or choose another folder"
-            } else {
-                "choose another folder"
-            };
-            return Err(cannot_create(format!("--out {} exists; {remedy}", folder.display())));
+    let mut number = 1u32;
+    loop {
+        let suffix = if number == 1 { String::new() } else { format!("-{number}") };
+        let folder = Path::new("runs").join(format!("{name}{suffix}"));
+        number += 1;
+        // One that exists is not touched, even if it is empty: another process may be about to begin in it.
+        if folder.symlink_metadata().is_ok() {
+            continue;
+        }
+        match Claim::begin(&folder, toml, command, false) {
+            Err(FolderError::Exists(..) | FolderError::Lock(LockError::Held { .. })) => {}
+            claimed => return Ok((folder, claimed?)),
         }
     }
-    std::fs::create_dir_all(folder).map_err(failed)?;
-    std::fs::write(folder.join(CONFIG), config.to_toml()?).map_err(failed)
+}
+
+pub(crate) fn refused(error: FolderError) -> anyhow::Error {
+    cannot_create(format!("--out {error}"))
 }
 
 /// The configuration of an existing run.
@@ -86,6 +95,8 @@ pub struct Trained {
     pub folder: Option<PathBuf>,
     /// Warnings about the weights.
     pub notes: Vec<String>,
+    /// Whether they are the weights that the finished run ended with, undamaged.
+    pub is_final: bool,
 }
 
 /// Loads a run folder, or a weights file together with a configuration file.
@@ -97,7 +108,7 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
         let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
         let config = crate::settings::read(Some(config))?;
         let (sha256, name) = (sha256::hex(&weights), path.display().to_string());
-        return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new() });
+        return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new(), is_final: true });
     }
     if !path.is_dir() {
         return Err(usage(format!("RUN: {} does not exist", path.display())));
@@ -106,20 +117,20 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
         return Err(usage("--config: a run folder has its own configuration; leave it out"));
     }
     let config = config_of(path)?;
-    let (weights, notes) = weights_of(path, &config)?;
+    let (weights, notes, is_final) = weights_of(path, &config)?;
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
-    Ok(Trained { config, sha256: sha256::hex(&weights), weights, name, folder: Some(path.to_owned()), notes })
+    Ok(Trained { config, sha256: sha256::hex(&weights), weights, name, folder: Some(path.to_owned()), notes, is_final })
 }
 
 /// The final weights if they exist and are intact, otherwise those of the newest usable checkpoint.
-fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec<String>)> {
+fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec<String>, bool)> {
     let mut notes = Vec::new();
     let expected = std::fs::read(folder.join(SUMMARY))
         .ok()
         .and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok())
         .and_then(|summary| summary["weights_sha256"].as_str().map(str::to_owned));
     match (std::fs::read(folder.join(WEIGHTS)), expected) {
-        (Ok(bytes), Some(expected)) if sha256::hex(&bytes) == expected => return Ok((bytes, notes)),
+        (Ok(bytes), Some(expected)) if sha256::hex(&bytes) == expected => return Ok((bytes, notes, true)),
         (Ok(_), Some(_)) => notes.push(format!("{WEIGHTS} is corrupt (its checksum differs from {SUMMARY})")),
         (Err(_), Some(_)) => notes.push(format!("{WEIGHTS} is missing")),
         (_, None) => notes.push("the run is not finished".to_owned()),
@@ -129,7 +140,7 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));
     notes.push(format!("using checkpoint {:06}", progress.iteration));
-    Ok((learned.weights()?, notes))
+    Ok((learned.weights()?, notes, false))
 }
 
 /// `checkpoint 000010 is corrupt (weights.safetensors: its checksum differs from the manifest)`
@@ -152,30 +163,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_default_name_describes_the_run_and_is_unused() {
-        let config = RunConfig::default();
-        assert_eq!(default_out(&config, |_| false), Path::new("runs/simple-spread-50-magex-s1"));
-        let taken = ["runs/simple-spread-50-magex-s1", "runs/simple-spread-50-magex-s1-2"];
-        let out = default_out(&config, |path| taken.iter().any(|t| path == Path::new(t)));
-        assert_eq!(out, Path::new("runs/simple-spread-50-magex-s1-3"));
-    }
-
-    #[test]
     fn a_folder_that_is_not_empty_is_rejected_with_a_remedy() {
-        let dir = std::env::temp_dir().join(format!("magex-folder-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&dir);
+        let place = tempfile::tempdir().unwrap();
+        let dir = place.path().join("run");
         let config = RunConfig::default();
-        std::fs::create_dir_all(&dir).unwrap();
-        create(&dir, &config).unwrap();
+        let toml = config.to_toml().unwrap();
+        let begin = || begin(Some(&dir), "", &toml, "test", false).map_err(refused);
+        let (_, claim) = begin().unwrap();
         assert_eq!(config_of(&dir).unwrap(), config);
-        let error = create(&dir, &config).unwrap_err();
+        let error = begin().unwrap_err();
         assert!(error.to_string().contains("--resume"), "{error}");
         assert_eq!(crate::failure::code_of(&error), magex_runtime::exit::CANNOT_CREATE);
+        drop(claim);
         std::fs::remove_file(dir.join(CONFIG)).unwrap();
         std::fs::write(dir.join("thesis.tex"), "").unwrap();
-        assert!(!create(&dir, &config).unwrap_err().to_string().contains("--resume"));
+        assert!(!begin().unwrap_err().to_string().contains("--resume"));
         assert!(config_of(&dir).unwrap_err().to_string().contains("not a run folder"));
-        std::fs::remove_dir_all(&dir).unwrap();
     }
 
     #[test]

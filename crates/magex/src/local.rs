@@ -31,11 +31,17 @@ impl LoadedPolicy {
         })
     }
 
-    /// Rolls out a plan on `threads` threads; the results are in the order of the plan.
-    pub(crate) fn rollout_all(&self, plan: &[Shard], threads: usize) -> Result<Vec<ShardResult>, CollectError> {
+    /// Rolls out a plan on `threads` threads; the results are in the order of the plan. Calls `done` after each shard.
+    pub(crate) fn rollout_all(
+        &self,
+        plan: &[Shard],
+        threads: usize,
+        done: impl Fn(&Shard) + Sync,
+    ) -> Result<Vec<ShardResult>, CollectError> {
         let goals = |request: &_| answer(&self.commander, self.random_assignment_fraction, request, &|| true);
         let rollout = |index: usize| {
             let result = self.roller.rollout(&plan[index], goals);
+            done(&plan[index]);
             result.map_err(|error| CollectError::Shard { shard: plan[index], reason: error.to_string() })
         };
         let results = parallel::in_order(threads, plan.len(), rollout).map_err(|_| CollectError::RolloutThread)?;
@@ -83,7 +89,7 @@ impl Collector for LocalCollector {
 
     fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError> {
         match &self.policy {
-            Some(policy) => policy.rollout_all(&plan, self.threads),
+            Some(policy) => policy.rollout_all(&plan, self.threads, |_| {}),
             None => Err(CollectError::NoWeights),
         }
     }

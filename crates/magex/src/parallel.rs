@@ -17,8 +17,12 @@ pub(crate) fn in_order<T: Send>(
     let take = || Some(next.fetch_add(1, Ordering::Relaxed)).filter(|&index| index < count);
     let worker = || std::iter::from_fn(|| take().map(|index| (index, work(index)))).collect::<Vec<_>>();
     let parts = std::thread::scope(|scope| {
-        let handles: Vec<_> = (0..threads.clamp(1, count.max(1))).map(|_| scope.spawn(worker)).collect();
-        handles.into_iter().map(|handle| handle.join().map_err(|_| WorkerPanicked)).collect::<Result<Vec<_>, _>>()
+        // Where the system has no more threads, there are fewer, in the end only this one.
+        let start = |_| std::thread::Builder::new().spawn_scoped(scope, worker).ok();
+        let handles: Vec<_> = (0..threads.clamp(1, count.max(1))).map_while(start).collect();
+        let own = if handles.is_empty() { worker() } else { Vec::new() };
+        let others = handles.into_iter().map(|handle| handle.join().map_err(|_| WorkerPanicked));
+        std::iter::once(Ok(own)).chain(others).collect::<Result<Vec<_>, _>>()
     })?;
     let mut all: Vec<(usize, T)> = parts.into_iter().flatten().collect();
     all.sort_unstable_by_key(|(index, _)| *index);

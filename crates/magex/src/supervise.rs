@@ -9,10 +9,13 @@ use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
 use magex_learner::run_events::RunEvent;
+use magex_learner::run_lock::RunLock;
+use magex_learner::trainer::TrainError;
 use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
-use magex_runtime::{client, exit, shutdown};
+use magex_runtime::{client, exit};
 use service::{Service, code_of, keep};
+use std::os::fd::{AsFd as _, AsRawFd as _};
 use std::path::Path;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -21,6 +24,9 @@ use tokio_util::sync::CancellationToken;
 
 /// The learner may die this often without completing an iteration in between.
 const LIVES: u32 = 4;
+
+/// After this time without an event the run says what it waits for.
+const SILENCE: Duration = Duration::from_secs(15);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TrainEnd {
@@ -42,6 +48,8 @@ pub(crate) struct ActorPlan {
 pub(crate) struct ServicesPlan<'a> {
     /// Run folder with a checkpoint.
     pub(crate) folder: &'a Path,
+    /// The lock of the folder, which the learner gets, too.
+    pub(crate) lock: &'a RunLock,
     pub(crate) threads: usize,
     /// Address of the live page, if there is one.
     pub(crate) http: Option<&'a str>,
@@ -49,24 +57,40 @@ pub(crate) struct ServicesPlan<'a> {
 }
 
 /// Trains on services of this machine until the run is complete or interrupted.
-pub(crate) fn run(plan: &ServicesPlan<'_>, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
-    let logs = plan.folder.join("logs");
-    std::fs::create_dir_all(&logs).with_context(|| logs.display().to_string())?;
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-    let end = runtime.block_on(supervise(plan, &logs, progress));
-    runtime.shutdown_background();
-    end
-}
-
-async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
-    let interrupted = shutdown::on_signal()?;
+pub(crate) async fn run(
+    plan: &ServicesPlan<'_>,
+    interrupted: &CancellationToken,
+    progress: &mut Progress,
+) -> anyhow::Result<TrainEnd> {
+    let logs = &plan.folder.join("logs");
+    std::fs::create_dir_all(logs).with_context(|| logs.display().to_string())?;
     let (out, threads) = (plan.folder.display().to_string(), plan.threads.to_string());
+    let descriptor = plan.lock.as_fd().as_raw_fd().to_string();
     let learner = |listen: &str, http: Option<&str>| {
-        let own: [&str; 8] = ["learner", "--resume", "--out", &out, "--threads", &threads, "--listen", listen];
+        let own: [&str; 10] = [
+            "learner",
+            "--resume",
+            "--out",
+            &out,
+            "--threads",
+            &threads,
+            "--listen",
+            listen,
+            "--lock-descriptor",
+            &descriptor,
+        ];
         let page = http.map(|http| ["--http", http]);
-        Service::new("learner", &own.into_iter().chain(page.into_iter().flatten()).collect::<Vec<_>>(), logs)
+        let arguments: Vec<&str> = own.into_iter().chain(page.into_iter().flatten()).collect();
+        Service::new("learner", &arguments, logs).inherit(plan.lock.as_fd())
     };
+    if interrupted.is_cancelled() {
+        return Ok(TrainEnd::Stopped);
+    }
     let mut running = learner("127.0.0.1:0", plan.http).start().await?;
+    if interrupted.is_cancelled() {
+        running.stop().await;
+        return Ok(TrainEnd::Stopped);
+    }
     // A restarted learner listens on the same ports, so that the other services and the page find it again.
     let learner = learner(&running.address, running.http.as_deref());
     if let Some(http) = &running.http {
@@ -94,16 +118,23 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
     let (sender, mut events) = mpsc::channel(64);
     let watching = tokio::spawn(watch(url.clone(), sender));
     let (mut lives, mut draining, mut shown) = (LIVES, false, (0, false));
+    let mut quiet = tokio::time::interval(SILENCE);
+    quiet.reset();
     let end = loop {
         tokio::select! {
             Some(event) = events.recv() => {
+                quiet.reset();
                 if is_new(&event, &mut shown) {
                     progress.event(&event);
                     lives = LIVES;
                 }
             }
+            _ = quiet.tick() => tell_what_is_missing(&url, logs).await,
             status = running.wait() => {
                 let status = status?;
+                if !plan.folder.is_dir() {
+                    break Err(TrainError::Gone(plan.folder.to_owned()).into());
+                }
                 let (code, reason) = (code_of(status), running.failure(status));
                 match code {
                     Some(exit::OK) => break Ok(TrainEnd::Finished),
@@ -126,6 +157,7 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
             }
             () = interrupted.cancelled(), if !draining => {
                 draining = true;
+                plan.lock.stopping();
                 progress.status("stopping after this iteration");
                 note("finishing the iteration, then writing a checkpoint");
                 if let Err(error) = drain(&url).await {
@@ -160,6 +192,23 @@ fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
     let new = place > *shown;
     *shown = place.max(*shown);
     new
+}
+
+/// Why nothing has happened for [`SILENCE`], if the learner waits for actors: the last words of an actor.
+async fn tell_what_is_missing(url: &str, logs: &Path) {
+    let status = async {
+        let mut client = LearnerServiceClient::new(client::endpoint(url)?.connect().await?);
+        anyhow::Ok(client.get_run(v1::GetRunRequest {}).await?.into_inner().run.unwrap_or_default())
+    };
+    let waits = match tokio::time::timeout(Duration::from_secs(3), status).await {
+        Ok(Ok(status)) if status.state() != v1::RunState::WaitingForActors => return,
+        Ok(Ok(_)) => "no actor is connected to the learner".to_owned(),
+        Ok(Err(error)) => format!("the learner does not answer: {error:#}"),
+        Err(_) => "the learner does not answer".to_owned(),
+    };
+    let log = std::fs::read_to_string(logs.join("actor-0.log")).unwrap_or_default();
+    let (silent_s, actor) = (SILENCE.as_secs(), log.lines().next_back().unwrap_or_default());
+    tracing::warn!(silent_s, actor, logs = %logs.display(), "{waits}");
 }
 
 async fn drain(url: &str) -> anyhow::Result<()> {

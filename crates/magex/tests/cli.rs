@@ -128,7 +128,8 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
     assert!(again["page"].is_null());
     assert_eq!(again["weights_sha256"], summary["weights_sha256"]);
 
-    let eval = place.json(&format!("eval {out} --episodes 20 --episode-seeds 1,2 --threads 1"));
+    let eval = place.json(&format!("eval {out} --episodes 20 --episode-seeds 1,2 --threads 1 --strict"));
+    assert_eq!((&eval["weights_final"], &eval["warnings"]), (&true.into(), &Value::Array(Vec::new())));
     assert_eq!((eval["rows"].as_array().unwrap().len(), &eval["mean"]["greedy"]["episodes"]), (4, &40.into()));
     assert_eq!(eval["weights_sha256"], summary["weights_sha256"]);
     // The cut into shards and threads does not change a number.
@@ -141,9 +142,9 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
         place.json(&format!("eval {out} --agents 12 --scheduler exact --mode greedy --episodes 2 --spawn lines"));
     assert_eq!((&larger["agents"], &larger["mean"]["greedy"]["cost_ratio"]), (&12.into(), &1.0.into()));
 
-    let replay = place.json(&format!("replay {out} --episodes 3 --mode both --out page.html"));
+    let replay = place.json(&format!("replay {out} --episodes 3 --mode both --out new/folders/page.html"));
     assert_eq!(replay["episodes"], 6);
-    assert!(fs::read_to_string(place.path("page.html")).unwrap().contains("<html"));
+    assert!(fs::read_to_string(place.path("new/folders/page.html")).unwrap().contains("<html"));
 
     // A weights file from elsewhere.
     let file = place
@@ -198,7 +199,9 @@ fn a_corrupt_checkpoint_is_named_and_the_one_before_it_is_used() {
     assert_eq!(names, ["000001", "000002", "000003"]);
     fs::remove_file(place.path("run/summary.json")).unwrap();
     fs::write(checkpoints.join("000003/weights.safetensors"), b"nonsense").unwrap();
-    let output = place.run("eval run --episodes 1");
+    place.fails("eval run --episodes 1 --strict", 1, &["--strict", "the run is not finished"]);
+    let output = place.run("eval run --episodes 1 --json");
+    assert_eq!(last_line(&output)["weights_final"], false);
     let stderr = text(&output.stderr);
     assert!(stderr.contains("checkpoint 000003 is corrupt") && stderr.contains("using checkpoint 000002"), "{stderr}");
     let output = place.run("train --resume --out run --in-process --json");
@@ -238,7 +241,7 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("train --resume", 64, &["--out"]),
         ("train --resume --out nowhere", 64, &["nowhere does not exist", "leave out --resume"]),
         ("train --resume --out full", 64, &["not a run folder"]),
-        ("train --resume --out run --seed 9", 64, &["run.seed is 1 there and 9 here"]),
+        ("train --resume --out run --seed 9", 64, &["run.seed was 1 and is 9", "--from run"]),
         ("eval nowhere", 64, &["nowhere does not exist"]),
         ("eval full", 64, &["not a run folder"]),
         ("eval run --eval-set 2", 64, &["3 or more"]),
@@ -248,7 +251,8 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("eval run --scheduler ranking", 64, &["use pairwise, exact or random"]),
         ("eval run --per-layout", 64, &["--spawn lines"]),
         ("eval run/weights.safetensors", 64, &["--config"]),
-        ("replay run --out nowhere/page.html --episodes 1", 73, &["nowhere/page.html"]),
+        ("replay run --out full/notes.txt/page.html --episodes 1", 73, &["full/notes.txt is not a folder"]),
+        ("eval run --record full --episodes 1", 73, &["full is a folder"]),
         ("verify nowhere", 64, &["nowhere"]),
         ("verify full", 1, &[]),
         ("assign --agents [[0,0]] --goals [[0]]", 64, &["goals"]),

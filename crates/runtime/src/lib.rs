@@ -6,6 +6,7 @@ pub mod client;
 pub mod exit;
 pub mod health;
 pub mod http;
+pub mod limits;
 pub mod metrics;
 pub mod net;
 pub mod process;

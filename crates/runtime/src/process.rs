@@ -60,11 +60,15 @@ fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAdd
     )
 }
 
+/// The name of this machine or container, in one word.
+pub fn host() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    host.split_whitespace().next().unwrap_or("host").to_owned()
+}
+
 /// A readable name of this process: host and process number.
 pub fn default_name() -> String {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let host = if host.trim().is_empty() { "host" } else { host.trim() };
-    format!("{host}-{}", std::process::id())
+    format!("{}-{}", host(), std::process::id())
 }
 
 /// The limit of open files of this process.

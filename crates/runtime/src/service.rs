@@ -6,12 +6,15 @@ use crate::http::{HttpArgs, Page, Router};
 use crate::net::connections::ConnectionLimits;
 use crate::server::{self, Incoming};
 use crate::telemetry::{self, LogFormat, TraceArgs};
-use crate::{process, shutdown};
+use crate::{limits, process, shutdown};
 use clap::Args;
 use serde::Serialize;
 use std::net::SocketAddr;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
+
+/// Threads of a service besides those of the network: its work, and calls that block.
+const OTHER_THREADS: usize = 4;
 
 /// Options of every service.
 #[derive(Debug, Clone, Default, Args, Serialize)]
@@ -41,7 +44,7 @@ pub struct ServiceArgs {
 /// What a running service gets from [`main`].
 #[derive(Debug)]
 pub struct Context {
-    /// Cancelled by the first SIGINT or SIGTERM.
+    /// Cancelled by the first SIGINT, SIGTERM, SIGUSR1 or SIGXCPU.
     pub stop: CancellationToken,
     name: &'static str,
     address: Option<SocketAddr>,
@@ -77,6 +80,8 @@ pub fn main<T>(
 ) -> Result<T, Failure> {
     process::allow_open_files();
     process::disable_huge_pages();
+    let files = if name == "learner" { limits::FILES } else { limits::FEW_FILES };
+    limits::require(files, threads + OTHER_THREADS)?;
     let internal = |error| Failure::new(exit::INTERNAL, error);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(threads)

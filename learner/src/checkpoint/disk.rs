@@ -1,5 +1,6 @@
 //! What writing to a run folder asks of the file system, one step at a time: a test can cut it off at each of them.
 
+use magex_runtime::limits::explained;
 use std::fs::{self, File};
 use std::io;
 use std::path::Path;
@@ -13,7 +14,7 @@ pub trait Disk: std::fmt::Debug + Send {
 
     /// Makes or replaces a file. A kill may leave part of it.
     fn write(&mut self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        fs::write(path, bytes)
+        fs::write(path, bytes).map_err(explained)
     }
 
     /// Returns once a file, or the entries of a folder, would survive a power cut.

@@ -19,6 +19,7 @@ fn progress(iteration: u32) -> Progress {
     Progress {
         run_id: "r".into(),
         config_sha256: "c".into(),
+        config: String::new(),
         iteration,
         joint_env_steps: 7,
         on_target: 1,

@@ -4,7 +4,8 @@ use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::report::observer::{FileError, RunObserver};
 use crate::report::records::IterationMetrics;
 use magex_proto::v1::IterationEvent;
-use std::collections::VecDeque;
+use magex_runtime::limits::explained;
+use std::collections::{BTreeMap, VecDeque};
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -39,13 +40,18 @@ impl MetricsFile {
             ErrorKind::NotFound => Ok(Vec::new()),
             _ => Err(io(error)),
         })?;
-        let is_kept = |line: &&str| {
-            serde_json::from_str::<serde_json::Value>(line).is_ok_and(|v| {
-                v["iteration"].as_u64().is_some_and(|i| i <= iteration.into()) && !v["executor"].is_null()
-            })
+        let trained = |line: &str| {
+            let value = serde_json::from_str::<serde_json::Value>(line).ok().filter(|v| !v["executor"].is_null())?;
+            value["iteration"].as_u64().filter(|&number| number <= iteration.into())
         };
         let text = String::from_utf8_lossy(&bytes);
-        let kept: String = text.lines().filter(is_kept).flat_map(|line| [line, "\n"]).collect();
+        // By number: each iteration is there once and in order, whatever wrote to the file.
+        let lines: BTreeMap<u64, &str> = text.lines().filter_map(|line| Some((trained(line)?, line))).collect();
+        let missing = u64::from(iteration).saturating_sub(lines.len() as u64);
+        if missing > 0 {
+            tracing::warn!(missing, path = %path.display(), "lines of earlier iterations are missing");
+        }
+        let kept: String = lines.values().flat_map(|line| [*line, "\n"]).collect();
         // Truncation works on a full disk, so a full disk does not keep a run from resuming.
         if bytes.starts_with(kept.as_bytes()) && path.exists() {
             let file = OpenOptions::new().write(true).open(&path).map_err(io)?;
@@ -72,7 +78,7 @@ impl MetricsFile {
             if let Err(error) = self.file.write_all(line.as_bytes()) {
                 // A part of the line may be written. Truncation works on a full disk.
                 self.file.set_len(self.length)?;
-                return Err(error);
+                return Err(explained(error));
             }
             self.length += line.len() as u64;
             self.waiting.pop_front();
@@ -133,5 +139,9 @@ mod tests {
         std::fs::write(&path, line(1) + "half\n" + &line(2)).unwrap();
         MetricsFile::reopen(folder.path(), 2).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
+        // Two processes wrote at once.
+        std::fs::write(&path, [3, 4, 1, 5, 2, 4, 3].map(line).concat()).unwrap();
+        MetricsFile::reopen(folder.path(), 4).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), [1, 2, 3, 4].map(line).concat());
     }
 }

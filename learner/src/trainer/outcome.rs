@@ -41,22 +41,63 @@ pub enum TrainError {
     Serialise(#[from] serde_json::Error),
     /// The run folder belongs to another configuration.
     #[error(
-        "{}: the checkpoint was made with another configuration; resume without a configuration file, or start a new run",
+        "{} continues with the configuration of its checkpoints, but {} (in its config.toml, a configuration file or an \
+         option); leave that out: only keys of [run] other than run.seed may change, or begin a new run from its weights \
+         with --from {}",
+        .0.display(), .1, .0.display()
+    )]
+    OtherConfiguration(PathBuf, String),
+    /// A budget that is spent already.
+    #[error(
+        "run.max_steps: the run has trained {done} steps, so its budget cannot be lowered to {requested}; give {done} or more"
+    )]
+    Budget {
+        /// As it was requested.
+        requested: u64,
+        /// Joint steps trained on.
+        done: u64,
+    },
+    /// The run cannot begin from the weights of another one.
+    #[error("--from {}: {}", .0.display(), .1)]
+    Parent(PathBuf, String),
+    /// The configuration names weights to begin from, and nothing says where they are.
+    #[error(
+        "run.initial_weights: the run begins from the weights {0}; name their run with --from RUN, or remove the key"
+    )]
+    NoParent(String),
+    /// The run folder was removed or replaced while the run went on.
+    #[error(
+        "{}: the run folder was removed or replaced while the run went on; what was trained since its last checkpoint is lost",
         .0.display()
     )]
-    OtherConfiguration(PathBuf),
+    Gone(PathBuf),
     /// The configuration could not be serialised.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The training threads could not be started.
-    #[error("training threads: {0}")]
-    Threads(#[from] rayon::ThreadPoolBuildError),
+    #[error("training threads cannot be started ({}); {}", .0, magex_runtime::limits::threads())]
+    Threads(String),
 }
 
 impl TrainError {
     /// Whether the configuration or the command line is at fault, not the run.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::OtherConfiguration(_) | Self::Config(_) | Self::Threads(_))
+        matches!(
+            self,
+            Self::OtherConfiguration(..)
+                | Self::Budget { .. }
+                | Self::Parent(..)
+                | Self::NoParent(_)
+                | Self::Config(_)
+                | Self::Threads(_)
+        )
+    }
+}
+
+impl TrainError {
+    /// Whether a file of the run folder cannot be written, or the folder is gone.
+    pub fn is_output(&self) -> bool {
+        matches!(self, Self::File(_) | Self::Gone(_) | Self::Checkpoint(CheckpointError::File { .. }))
     }
 }
 

@@ -53,6 +53,7 @@ impl Trainer {
     ) -> Result<Option<StopReason>, TrainError> {
         let (start, mut backoff, mut reported) = (Instant::now(), Backoff::default(), false);
         loop {
+            self.is_there()?;
             let Err(error) = self.write_files(files) else { return Ok(None) };
             if start.elapsed() >= LAST_FILES_PATIENCE {
                 return Err(TrainError::LastFiles(error, LAST_FILES_PATIENCE.as_secs()));
@@ -84,7 +85,9 @@ impl Trainer {
     }
 
     pub(super) fn checkpoint(&mut self) -> Result<PathBuf, TrainError> {
-        // A checkpoint that survives a power cut has the lines of its iterations.
+        self.is_there()?;
+        // A checkpoint has the lines of its iterations, also after a power cut: a resume does not write them again.
+        self.observers.iter_mut().try_for_each(|observer| observer.flush())?;
         self.notify(|observer| observer.sync());
         let progress = Progress { wall_s: self.wall_s(), ..self.progress.clone() };
         Ok(checkpoint::write(&self.folder, &progress, &self.learned, self.config.run.keep_checkpoints)?)

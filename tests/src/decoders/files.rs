@@ -40,6 +40,7 @@ impl Default for Run {
         let progress = Progress {
             run_id: "r".into(),
             config_sha256: "c".into(),
+            config: String::new(),
             iteration: 1,
             joint_env_steps: 7,
             on_target: 1,

@@ -26,6 +26,7 @@ Examples:
   magex eval RUN --controller scripted             the scripted baseline
   magex eval RUN --spawn lines --per-layout        one row per layout
   magex eval weights.safetensors --config config.toml   a weights file
+  magex eval RUN --strict --json                   for scripts
 
 success: share of landmarks with an agent within 0.15 at the end. matched: the
 same with one agent per landmark. all covered: share of episodes with every
@@ -81,6 +82,7 @@ struct Row {
 
 pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let output = options.output();
+    args.record.as_deref().map_or(Ok(()), artifacts::check)?;
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
     let scheduler = vary.scheduler_of(&config);
@@ -149,6 +151,8 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
     output.result(&json!({
         "run": args.subject.run,
         "weights_sha256": trained.sha256,
+        "weights_final": trained.is_final,
+        "warnings": trained.notes,
         "task": config.task.name,
         "agents": config.task.agents,
         "horizon": config.task.horizon,

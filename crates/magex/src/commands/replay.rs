@@ -1,8 +1,9 @@
 //! `magex replay`
 
-use crate::artifacts::{describe, write_replay};
+use crate::artifacts::{self, describe, write_replay};
 use crate::evaluate::{Controller, Episodes, Modes, Subject, mode_name, roll_out};
 use crate::options::CommonOptions;
+use crate::output::note;
 use magex_runtime::exit;
 use magex_runtime::process::processors;
 use serde_json::json;
@@ -39,9 +40,11 @@ pub(crate) struct ReplayArgs {
 
 pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let output = options.output();
+    args.out.as_deref().map_or(Ok(()), artifacts::check)?;
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
     let policy = vary.policy(&config, &trained.weights)?;
+    note(format!("{} · N = {} · recording {} episodes", trained.name, config.task.agents, args.episodes));
     let mut episodes = Vec::new();
     for &mode in args.mode.list() {
         let wanted = Episodes { count: args.episodes, set: args.subject.eval_set, mode, record: args.episodes };

@@ -15,13 +15,14 @@ Examples:
       --tls-key server.key --identities clients.toml
   magex learner --out runs/mine --resume
   magex learner --out runs/mine --resume-or-create --stay    restart policy
+  magex learner --config new.toml --from runs/mine --out runs/next
 
 Options can also be set in the environment; the command line takes precedence.
 Actors and commander may start before or after the learner.
 
 Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or
-configuration, 69 the port is in use, 73 --out exists or cannot be written,
-75 stopped before the end (--resume continues), 130 interrupted twice";
+configuration, 69 the port is in use, 73 --out exists, cannot be written or is
+written by another process, 75 stopped before the end (--resume continues), 130 interrupted twice";
 
 const ACTOR_HELP: &str = "\
 Examples:

@@ -1,7 +1,7 @@
 //! `magex train`: read the configuration, prepare the run folder, run, report.
 
 use crate::artifacts::{run_name, write_curve, write_recorded_replay};
-use crate::failure::{coded, usage};
+use crate::failure::{cannot_create, code_of, coded, usage};
 use crate::folder;
 use crate::local::LocalCollector;
 use crate::options::CommonOptions;
@@ -14,16 +14,19 @@ use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
 use magex_learner::report::records::Summary;
-use magex_learner::trainer::{TrainError, TrainOutcome, Trainer};
+use magex_learner::run_folder::{Claim, RunFolderState};
+use magex_learner::run_start::Parent;
+use magex_learner::trainer::{TrainOutcome, Trainer};
 use magex_runtime::process::processors;
-use magex_runtime::{backoff, exit, http, server, shutdown};
+use magex_runtime::{backoff, exit, http, limits, server, shutdown};
 use magex_viewer::page::{LivePage, RunInfo};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::Instant;
+use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
 const AFTER_HELP: &str = "\
@@ -32,19 +35,30 @@ Examples:
   magex train --executor local --seed 2    the small network, another seed
   magex train my.toml --out runs/mine      a configuration of your own
   magex train --resume --out runs/mine     continue after Ctrl-C or a crash
+  magex train --resume --out runs/mine --max-steps 50000    train on
+  magex train new.toml --from runs/mine    begin from the weights of a run
   magex train --in-process --json          one process; result as JSON
   magex train --http 127.0.0.1:8080        fixed port for the live page
 
 The run folder gets config.toml, metrics.jsonl, checkpoints/,
-weights.safetensors, summary.json, curve.svg, replay.html and tensorboard/.
+weights.safetensors, summary.json, recordings.json, curve.svg, replay.html,
+tensorboard/, logs/ and .lock; README.md explains each.
 The address of the live page is printed at the start. The same configuration
 and seed give the same weights, in one process or with any number of actors.
 The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to
-resume; a second Ctrl-C stops at once.
+resume; a second Ctrl-C, half a second later or more, stops at once. SIGTERM,
+SIGUSR1 and SIGHUP are like the first Ctrl-C.
 
 Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-73 --out exists or cannot be written, 75 stopped before the end (--resume
-continues), 130 interrupted twice";
+69 the port of the page is in use, 73 --out exists, cannot be written or is
+written by another process, 75 stopped before the end (--resume continues),
+130 interrupted twice";
+
+/// Threads of this process besides those that train.
+const OWN_THREADS: usize = 4;
+
+/// The name of this process in the lock of a run folder.
+const COMMAND: &str = "magex train";
 
 /// Train a team and write a run folder.
 #[derive(Debug, Clone, clap::Args)]
@@ -56,9 +70,17 @@ pub(crate) struct TrainArgs {
     /// Run folder [default: runs/<task>-<N>-<executor>-s<seed>, with -2, -3, … if it exists].
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Continue the run in --out from its newest usable checkpoint.
+    /// Continue the run in --out from its newest usable checkpoint; keys of [run] may change (budget, target, evaluations,
+    /// checkpoints).
     #[arg(long, requires = "out")]
     resume: bool,
+    /// Begin from the weights of another run: its newest checkpoint. Team size, rewards and step sizes may differ; without a
+    /// configuration file, that run's configuration is used.
+    #[arg(long, value_name = "RUN")]
+    from: Option<PathBuf>,
+    /// With --from: begin with the state of its optimiser, too.
+    #[arg(long, requires = "from")]
+    keep_optimiser: bool,
     /// Actor processes.
     #[arg(long, value_name = "N", default_value = "2", value_parser = settings::actors)]
     actors: usize,
@@ -82,18 +104,29 @@ pub(crate) struct TrainArgs {
 pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let (started, output) = (Instant::now(), options.output());
 
-    let config = read(args)?;
+    let (config, parent) = read(args)?;
     if args.print_config {
         output.say(config.to_toml()?.trim_end());
         output.result(&serde_json::to_value(&config)?);
         return Ok(exit::OK);
     }
 
-    let plan = prepare(args, config)?;
+    // The page, the training thread and the threads of training or of the services.
+    limits::require(limits::FILES, OWN_THREADS)?;
+    // Before anything is created: from here on a signal leaves a run that can be resumed.
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let interrupted = runtime.block_on(async { shutdown::on_signal_or_hangup() })?;
+    let plan = prepare(args, config, parent)?;
     let mut progress = Progress::start(&plan.config, &plan.title, &plan.folder.display().to_string());
-    let end = train(&plan, &mut progress);
+    let end = train(&plan, &runtime, interrupted, &mut progress);
+    runtime.shutdown_background();
     progress.end();
-    let end = end?;
+    let end = end.inspect_err(|error| {
+        // Nothing was started: a corrected command finds nothing in its way.
+        if [exit::USAGE, exit::UNAVAILABLE, exit::CANNOT_CREATE].contains(&code_of(error)) {
+            plan.claim.abandon();
+        }
+    })?;
 
     if let Err(error) = write_curve(&plan.folder, &plan.config) {
         tracing::warn!("no curve.svg: {error:#}");
@@ -106,43 +139,29 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
 
 // --- Read -------------------------------------------------------------------------------------------------------------
 
-/// Defaults < file < options. A resumed run keeps the configuration that it began with.
-fn read(args: &TrainArgs) -> anyhow::Result<RunConfig> {
-    let Some(folder) = args.out.as_deref().filter(|_| args.resume) else {
-        return Ok(args.overrides.apply(settings::read(args.config.as_deref())?)?);
-    };
-    if !folder.exists() {
+/// Defaults < file < options. A resumed run continues with its own configuration in place of the defaults, one that begins from
+/// the weights of another run with that run's.
+fn read(args: &TrainArgs) -> anyhow::Result<(RunConfig, Option<Parent>)> {
+    let resumed = args.out.as_deref().filter(|_| args.resume);
+    if let Some(folder) = resumed.filter(|folder| !folder.exists()) {
         return Err(usage(format!("--out {} does not exist: leave out --resume to start a new run", folder.display())));
     }
-    let own = folder::config_of(folder)?;
-    let requested = match &args.config {
-        Some(path) => args.overrides.apply(settings::read(Some(path))?)?,
-        None => args.overrides.apply(own.clone())?,
+    let own = resumed.map(folder::config_of).transpose()?;
+    if resumed.is_some_and(|folder| args.from.is_some() && RunFolderState::of(folder) != RunFolderState::Begun) {
+        return Err(usage("--from: the run has begun; leave out --from to continue it, or choose another --out"));
+    }
+    let parent = args.from.as_deref().map(Parent::read).transpose()?;
+    let base = match (&args.config, own) {
+        (Some(path), _) => settings::read(Some(path))?,
+        (None, Some(own)) => own,
+        (None, None) => parent.as_ref().map_or_else(RunConfig::default, Parent::config),
     };
-    if requested != own {
-        let differences = differences("", &serde_json::to_value(&own)?, &serde_json::to_value(&requested)?).join(", ");
-        return Err(usage(format!(
-            "--resume continues a run with the configuration that it began with ({}/config.toml), but {differences}; \
-             leave these out, or start a new run with another --out",
-            folder.display()
-        )));
-    }
-    Ok(own)
-}
-
-/// `run.seed is 1 there and 2 here`
-fn differences(path: &str, own: &Value, requested: &Value) -> Vec<String> {
-    match (own, requested) {
-        (Value::Object(own), Value::Object(requested)) => own
-            .iter()
-            .flat_map(|(key, value)| {
-                let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-                differences(&path, value, requested.get(key).unwrap_or(&Value::Null))
-            })
-            .collect(),
-        _ if own == requested => Vec::new(),
-        _ => vec![format!("{path} is {own} there and {requested} here")],
-    }
+    let config = args.overrides.apply(base)?;
+    let config = match &parent {
+        Some(parent) => parent.recorded(config, args.keep_optimiser)?,
+        None => config,
+    };
+    Ok((config, parent))
 }
 
 // --- Prepare ----------------------------------------------------------------------------------------------------------
@@ -151,6 +170,11 @@ fn differences(path: &str, own: &Value, requested: &Value) -> Vec<String> {
 struct Plan {
     config: RunConfig,
     folder: PathBuf,
+    /// The right to write to it.
+    claim: Arc<Claim>,
+    /// The run whose weights this one begins from.
+    parent: Option<Parent>,
+    /// Whether there is a checkpoint to continue from.
     resume: bool,
     threads: usize,
     /// Address of the live page, if there is one.
@@ -161,15 +185,20 @@ struct Plan {
 }
 
 /// Checks the options and creates the folder of a new run.
-fn prepare(args: &TrainArgs, config: RunConfig) -> anyhow::Result<Plan> {
+fn prepare(args: &TrainArgs, config: RunConfig, parent: Option<Parent>) -> anyhow::Result<Plan> {
     let http = (args.http != "off").then(|| args.http.clone());
     if let Some(listen) = &http {
         server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
     }
-    let folder = args.out.clone().unwrap_or_else(|| folder::default_out(&config, Path::exists));
-    if !args.resume {
-        folder::create(&folder, &config)?;
-    }
+    let out = args.out.as_deref();
+    let resumed = out.filter(|folder| args.resume && RunFolderState::of(folder) != RunFolderState::Begun);
+    let (folder, claim) = match resumed {
+        Some(folder) => (folder.to_owned(), Claim::resume(folder, COMMAND, None).map_err(folder::refused)?),
+        None => {
+            let (name, toml) = (folder::default_name(&config), config.to_toml()?);
+            folder::begin(out, &name, &toml, COMMAND, args.resume).map_err(folder::refused)?
+        }
+    };
     let threads = args.threads.unwrap_or_else(processors);
     let (actors, title) = if args.in_process {
         (None, format!("one process, {threads} threads"))
@@ -177,30 +206,41 @@ fn prepare(args: &TrainArgs, config: RunConfig) -> anyhow::Result<Plan> {
         let plan = ActorPlan { actors: args.actors, threads: (processors() / args.actors).max(1) };
         (Some(plan), format!("learner, commander and {} actors on this machine", args.actors))
     };
-    Ok(Plan { config, folder, resume: args.resume, threads, http, actors, title })
+    Ok(Plan { config, folder, claim: Arc::new(claim), parent, resume: resumed.is_some(), threads, http, actors, title })
 }
 
 // --- Run --------------------------------------------------------------------------------------------------------------
 
-fn train(plan: &Plan, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
+fn train(
+    plan: &Plan,
+    runtime: &Runtime,
+    interrupted: CancellationToken,
+    progress: &mut Progress,
+) -> anyhow::Result<TrainEnd> {
     // With services too, the run is created or checked here: errors reach the terminal instead of a log file, and the
     // learner process always continues from a checkpoint.
     let trainer = open(plan)?;
     match plan.actors {
-        None => train_in_process(plan, trainer, progress),
+        None => train_in_process(plan, trainer, runtime, interrupted, progress),
         Some(actors) => {
             drop(trainer);
             let (folder, http) = (plan.folder.as_path(), plan.http.as_deref());
-            supervise::run(&ServicesPlan { folder, threads: plan.threads, http, actors }, progress)
+            let lock = &plan.claim.lock;
+            let services = ServicesPlan { folder, lock, threads: plan.threads, http, actors };
+            runtime.block_on(supervise::run(&services, &interrupted, progress))
         }
     }
 }
 
 /// Creates the run, or opens the newest usable checkpoint; logs what is wrong with newer ones.
-fn open(plan: &Plan) -> Result<Trainer, TrainError> {
+fn open(plan: &Plan) -> anyhow::Result<Trainer> {
     if !plan.resume {
         let run_id = RunId(format!("{:016x}", backoff::random_id()));
-        return Trainer::create(&plan.config, run_id, &plan.folder, plan.threads);
+        let created = Trainer::create_from(plan.parent.as_ref(), &plan.config, run_id, &plan.folder, plan.threads);
+        return created.map_err(|error| match error {
+            error if error.is_output() => cannot_create(error),
+            error => error.into(),
+        });
     }
     let (trainer, skipped) = Trainer::resume(&plan.config, &plan.folder, plan.threads)?;
     let from = folder::continues_from(&plan.folder, skipped.len()).unwrap_or_default();
@@ -214,13 +254,23 @@ fn open(plan: &Plan) -> Result<Trainer, TrainError> {
 }
 
 /// Learner, commander and rollouts as threads of this process.
-fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) -> anyhow::Result<TrainEnd> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+fn train_in_process(
+    plan: &Plan,
+    mut trainer: Trainer,
+    runtime: &Runtime,
+    interrupted: CancellationToken,
+    progress: &mut Progress,
+) -> anyhow::Result<TrainEnd> {
+    if interrupted.is_cancelled() {
+        return Ok(TrainEnd::Stopped);
+    }
     let stop = Arc::new(AtomicBool::new(false));
-    let (signal, flag) = (runtime.block_on(async { shutdown::on_signal() })?, stop.clone());
+    let flag = stop.clone();
+    let told = plan.claim.clone();
     runtime.spawn(async move {
-        signal.cancelled().await;
+        interrupted.cancelled().await;
         flag.store(true, Ordering::Relaxed);
+        told.lock.stopping();
         note("finishing the iteration, then writing a checkpoint");
     });
 
@@ -241,7 +291,8 @@ fn train_in_process(plan: &Plan, mut trainer: Trainer, progress: &mut Progress) 
     let mut collector = LocalCollector::new(&plan.config, plan.threads, stop);
     let outcome = std::thread::scope(|scope| {
         let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);
-        let training = thread.spawn_scoped(scope, move || trainer.run(&mut collector))?;
+        let training = thread.spawn_scoped(scope, move || trainer.run(&mut collector));
+        let training = training.map_err(|error| limits::no_thread(&error, "the training thread cannot be started"))?;
         received.iter().for_each(|event| progress.event(&event));
         training.join().map_err(|_| coded(exit::INTERNAL, "the training thread panicked; its message is above"))
     })?;
@@ -313,21 +364,4 @@ fn report_stopped(plan: &Plan, output: Output) -> u8 {
     output.say(format!("\nStopped before the end. Continue with\n  {command}"));
     output.result(&json!({ "stopped": true, "out": plan.folder, "resume": command, "exit_code": exit::TEMPORARY }));
     exit::TEMPORARY
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn differences_name_the_keys_and_both_values() {
-        let own = serde_json::to_value(RunConfig::default()).unwrap();
-        let mut other = RunConfig::default();
-        (other.run.seed, other.mappo.gamma) = (2, 0.5);
-        let requested = serde_json::to_value(&other).unwrap();
-        let words = differences("", &own, &requested);
-        assert_eq!(words.len(), 2);
-        assert!(words.contains(&"run.seed is 1 there and 2 here".to_owned()), "{words:?}");
-        assert!(differences("", &own, &own).is_empty());
-    }
 }

@@ -3,29 +3,29 @@
 //! Imitation of the exact solver comes first, then PPO with the paper's reward R_c = 1 − C_c / C_h.
 
 use crate::artifacts;
-use crate::failure::usage;
+use crate::failure::{cannot_create, usage};
 use crate::folder;
 use crate::options::CommonOptions;
 use crate::output::{Output, Table, note, program, seconds};
 use crate::parallel;
 use crate::settings;
 use crate::synthetic::Synthetic;
-use anyhow::Context as _;
 use magex_assign::exact_points;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::sha256;
 use magex_core::task::Spawn;
+use magex_learner::run_folder::FolderError;
 use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
 use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
-use magex_runtime::exit;
 use magex_runtime::process::processors;
+use magex_runtime::{exit, shutdown};
 use serde_json::{Value, json};
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
+use tokio_util::sync::CancellationToken;
 
 const AFTER_HELP: &str = "\
 Examples:
@@ -39,7 +39,8 @@ of magex train. The same options and seed give the same weights with any number
 of threads.
 
 Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-73 --out exists or cannot be written";
+73 --out exists or cannot be written, 75 stopped before the end (nothing is
+kept), 130 interrupted twice";
 
 /// Train the goal scheduler alone, on synthetic teams of 2 to 200 agents.
 #[derive(Debug, Clone, clap::Args)]
@@ -91,19 +92,39 @@ pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow:
         return Err(usage("--imitation and --ppo: both are 0; at least one must be positive"));
     }
     let name = format!("commander-s{}", config.run.seed);
-    let out = args.out.clone().unwrap_or_else(|| folder::unused(&name, Path::exists));
-    folder::create(&out, &config)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let stop = runtime.block_on(async { shutdown::on_signal_or_hangup() })?;
+    let begun = folder::begin(args.out.as_deref(), &name, &config.to_toml()?, "magex train-commander", true);
+    let (out, claim) = begun.map_err(|error| match error {
+        FolderError::Exists(out, _) => cannot_create(format!("--out {} exists; choose another folder", out.display())),
+        other => folder::refused(other),
+    })?;
     let training = Training {
+        stop,
         ppo: CommanderPpo::new(&config.commander, &config.task, config.run.seed),
         args: args.clone(),
         threads: args.threads.unwrap_or_else(processors),
         config,
         out,
     };
-    training.run(options.output())
+    let output = options.output();
+    match training.run(output) {
+        Ok(true) => Ok(exit::OK),
+        Ok(false) => {
+            claim.abandon();
+            output.say("\nStopped before the end; nothing was kept. The same command begins again.");
+            output.result(&json!({ "stopped": true, "exit_code": exit::TEMPORARY }));
+            Ok(exit::TEMPORARY)
+        }
+        Err(error) => {
+            claim.abandon();
+            Err(error)
+        }
+    }
 }
 
 struct Training {
+    stop: CancellationToken,
     config: RunConfig,
     ppo: CommanderPpo,
     args: TrainCommanderArgs,
@@ -112,15 +133,19 @@ struct Training {
 }
 
 impl Training {
-    fn run(&self, output: Output) -> anyhow::Result<u8> {
+    /// Trains and writes the folder at the end, all at once; false if it was stopped.
+    fn run(&self, output: Output) -> anyhow::Result<bool> {
         let clock = Instant::now();
-        let mut metrics = std::fs::File::create(self.out.join("metrics.jsonl")).context("metrics.jsonl")?;
+        let mut metrics = String::new();
         let mut network = self.ppo.init()?;
         let untrained = self.validate(&network)?;
         let mut measured = untrained.clone();
         let TrainCommanderArgs { imitation, ppo, batch, .. } = self.args;
         for (stage, steps) in [("imitation", imitation), ("ppo", ppo)] {
             for step in 0..steps {
+                if self.stop.is_cancelled() {
+                    return Ok(false);
+                }
                 let rate = 1.0 - f64::from(step) / f64::from(steps);
                 let (loss, entropy) = match stage {
                     "imitation" => (self.imitate(&mut network, step, rate)?, None),
@@ -133,12 +158,11 @@ impl Training {
                         "stage": stage, "step": done, "instances": u64::from(done) * u64::from(batch), "loss": loss,
                         "entropy": entropy, "cost_ratio": named(&measured), "wall_s": clock.elapsed().as_secs_f64(),
                     });
-                    writeln!(metrics, "{line}").context("metrics.jsonl")?;
+                    metrics += &format!("{line}\n");
                     note(format!("{stage} {done} of {steps}: loss {loss:.4}, cost ratio {}", list(&measured)));
                 }
             }
         }
-        metrics.sync_all().context("metrics.jsonl")?;
         let weights = to_safetensors(&[("commander", &network.params)], "{\"format\":1}")?;
         let summary = json!({
             "weights_sha256": sha256::hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
@@ -146,10 +170,11 @@ impl Training {
             "cost_ratio": named(&measured), "untrained_cost_ratio": named(&untrained),
             "wall_s": clock.elapsed().as_secs_f64(),
         });
+        artifacts::write(&self.out.join("metrics.jsonl"), metrics.as_bytes())?;
         artifacts::write(&self.out.join(folder::WEIGHTS), &weights)?;
         artifacts::write(&self.out.join(folder::SUMMARY), &serde_json::to_vec(&summary)?)?;
         self.report(output, &untrained, &measured, summary);
-        Ok(exit::OK)
+        Ok(true)
     }
 
     fn stream(&self, set: u32, step: u32, k: u32) -> Stream {
@@ -258,9 +283,12 @@ mod tests {
                 batch: 4,
                 threads: None,
             };
-            folder::create(&out, &config).unwrap();
+            std::fs::create_dir_all(&out).unwrap();
+            std::fs::write(out.join(folder::CONFIG), config.to_toml().unwrap()).unwrap();
             let ppo = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-            Training { config, ppo, args, threads, out: out.clone() }.run(Output::new(true)).unwrap();
+            Training { stop: CancellationToken::new(), config, ppo, args, threads, out: out.clone() }
+                .run(Output::new(true))
+                .unwrap();
             let loaded = folder::load(&out, None).unwrap();
             assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
             crate::local::commander(&loaded.config, &loaded.weights, None).unwrap();

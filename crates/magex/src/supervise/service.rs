@@ -5,11 +5,16 @@ use crate::parent_watch;
 use anyhow::{Context as _, anyhow};
 use magex_runtime::backoff::Backoff;
 use magex_runtime::exit;
+use magex_runtime::limits;
+use magex_runtime::sync::lock;
+use rustix::io::{FdFlags, fcntl_setfd};
 use rustix::process::{Pid, Signal, kill_process};
 use std::fs::OpenOptions;
+use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdin, Command};
@@ -26,11 +31,15 @@ const STABLE: Duration = Duration::from_secs(20);
 
 /// How to start a service.
 #[derive(Debug, Clone)]
-pub struct Service {
+pub struct Service<'a> {
     name: String,
     arguments: Vec<String>,
     log: PathBuf,
+    inherit: Option<BorrowedFd<'a>>,
 }
+
+/// One child is started at a time: an inherited descriptor is open to every child that is started meanwhile.
+static START_ONE: Mutex<()> = Mutex::new(());
 
 /// A running service.
 #[derive(Debug)]
@@ -47,11 +56,25 @@ pub struct Running {
     pub(crate) http: Option<String>,
 }
 
-impl Service {
+impl<'a> Service<'a> {
     /// The command line `magex <arguments>`; standard error is appended to `<name>.log` in `logs`.
     pub fn new(name: &str, arguments: &[&str], logs: &Path) -> Self {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")) }
+        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")), inherit: None }
+    }
+
+    /// The service gets this open file under the same number.
+    pub fn inherit(self, descriptor: BorrowedFd<'a>) -> Self {
+        Self { inherit: Some(descriptor), ..self }
+    }
+
+    fn spawn(&self, command: &mut Command) -> std::io::Result<Child> {
+        let _one = lock(&START_ONE);
+        let Some(descriptor) = self.inherit else { return command.spawn() };
+        fcntl_setfd(descriptor, FdFlags::empty())?;
+        let child = command.spawn();
+        fcntl_setfd(descriptor, FdFlags::CLOEXEC)?;
+        child
     }
 
     /// Starts it and waits until it is ready.
@@ -76,7 +99,7 @@ impl Service {
             .stderr(log)
             .process_group(0)
             .kill_on_drop(true);
-        let mut child = command.spawn().with_context(|| format!("starting the {}", self.name))?;
+        let mut child = self.spawn(&mut command).with_context(|| format!("starting the {}", self.name))?;
         let (stdout, stdin) = (child.stdout.take(), child.stdin.take());
         let (name, log) = (self.name.clone(), self.log.clone());
         let mut running = Running { name, child, _stdin: stdin, log, log_start, address: String::new(), http: None };
@@ -158,19 +181,27 @@ impl Running {
 
     /// Why it ended: the signal, or the tail of its standard error.
     pub(crate) fn failure(&self, status: ExitStatus) -> String {
-        if let Some(signal) = status.signal() {
-            return format!("killed by signal {signal}");
-        }
         let bytes = std::fs::read(&self.log).unwrap_or_default();
         let own = bytes.get(self.log_start as usize..).unwrap_or_default();
         let text = String::from_utf8_lossy(own);
         let line = text.lines().rev().find(|line| !line.trim().is_empty());
-        line.map_or_else(|| status.to_string(), |line| line.trim_start_matches("error: ").to_owned())
+        let line = line.map(|line| line.trim_start_matches("error: ").to_owned());
+        match (status.signal(), limits::memory()) {
+            (Some(9), Some((limit, name))) => {
+                let limit = limit >> 20;
+                format!(
+                    "killed by signal 9, as the system does when memory runs out; the limit is {limit} MiB ({name})"
+                )
+            }
+            (Some(6), _) => format!("aborted: {}", line.unwrap_or_default()),
+            (Some(signal), _) => format!("killed by signal {signal}"),
+            (None, _) => line.unwrap_or_else(|| status.to_string()),
+        }
     }
 }
 
 /// Keeps a service running until `stop`, or until its work is done.
-pub(crate) async fn keep(service: Service, first: Running, stop: CancellationToken) -> anyhow::Result<()> {
+pub(crate) async fn keep(service: Service<'static>, first: Running, stop: CancellationToken) -> anyhow::Result<()> {
     let mut running = first;
     let (mut lives, mut backoff) = (LIVES, Backoff::default());
     loop {

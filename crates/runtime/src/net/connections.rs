@@ -23,8 +23,9 @@ use tokio_stream::Stream;
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-/// Files that a process needs besides its connections.
+/// Files that a process needs besides its connections; half of them if there are few, but not less than it cannot do without.
 const OTHER_FILES: usize = 128;
+const LEAST_FILES: usize = 24;
 /// What one address may have in flight without credentials: for probes and tools.
 const ANONYMOUS: InFlightLimits = InFlightLimits { calls: 256, streams: 64, caller_bytes: 1 << 20, bytes: 16 << 20 };
 /// Pause after a failed accept (no file descriptors are left).
@@ -77,9 +78,14 @@ struct Entry {
     close: CancellationToken,
 }
 
+/// How many of the files that a process may open are for connections.
+fn for_connections(files: usize) -> usize {
+    files.saturating_sub((files / 2).clamp(LEAST_FILES, OTHER_FILES)).max(1)
+}
+
 impl Connections {
     fn new(limits: ConnectionLimits) -> Self {
-        let files = crate::process::open_files().saturating_sub(OTHER_FILES).max(1);
+        let files = for_connections(crate::process::open_files());
         if files < limits.total {
             tracing::debug!(files, "connection limit lowered to the limit of open files");
         }
@@ -325,6 +331,11 @@ mod tests {
 
     fn closed(slot: &mut Slot) -> bool {
         slot.check(&mut Context::from_waker(std::task::Waker::noop())).is_err()
+    }
+
+    #[test]
+    fn few_open_files_leave_room_for_a_training() {
+        assert_eq!([20, 32, 48, 64, 128, 1024].map(for_connections), [1, 8, 24, 32, 64, 896]);
     }
 
     #[tokio::test]
