@@ -77,8 +77,8 @@ impl CommanderService for CommanderApi {
         caller(&request, CLIENT)?;
         let budget = budget(&request);
         let teams = request.into_inner().teams;
-        if teams.is_empty() || teams.len() > self.limits.teams {
-            let problem = format!("{} teams; send 1 to {}", teams.len(), self.limits.teams);
+        if teams.len() > self.limits.teams {
+            let problem = format!("{} teams exceed the limit of {}", teams.len(), self.limits.teams);
             return Err(status::invalid_argument("teams", problem));
         }
         let read = |(k, team)| {

@@ -228,7 +228,8 @@ fn read(field: &str, text: &str) -> anyhow::Result<String> {
 }
 
 fn positions(field: &str, points: &[Vec<f32>]) -> anyhow::Result<v1::Positions> {
-    let dims = points.first().map_or(0, Vec::len);
+    // An empty side is answered, too: the members of the other one are left over.
+    let dims = points.first().map_or(2, Vec::len);
     if !(2..=3).contains(&dims) {
         return Err(usage(format!("{field}: points of 2 or 3 coordinates are needed, the first has {dims}")));
     }
@@ -246,8 +247,9 @@ mod tests {
     #[test]
     fn points_must_agree_in_their_dimensions() {
         assert_eq!(positions("agents", &[vec![1.0, 2.0], vec![3.0, 4.0]]).unwrap().coordinates, [1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(positions("agents", &[]).unwrap(), v1::Positions { dims: 2, ..Default::default() });
         for (points, words) in [
-            (vec![], "the first has 0"),
+            (vec![vec![]], "the first has 0"),
             (vec![vec![1.0]], "the first has 1"),
             (vec![vec![1.0, 2.0], vec![1.0]], "agents[1]: 1 coordinates"),
         ] {
