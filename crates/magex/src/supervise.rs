@@ -86,7 +86,7 @@ async fn supervise(plan: &ServicesPlan<'_>, logs: &Path, progress: &mut Progress
         let (name, threads) = (format!("actor-{index}"), plan.actors.threads.to_string());
         let arguments =
             ["actor", "--name", &name, "--learner", &url, "--commander", &commander_url, "--threads", &threads];
-        let actor = Service::new(&name, &arguments, logs);
+        let actor = Service::new(&name, &arguments, logs).unawaited();
         let first = actor.start().await?;
         services.spawn(keep(actor, first, stop.clone()));
     }

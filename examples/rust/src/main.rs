@@ -5,7 +5,8 @@
 //! cargo run -p magex-example-client -- http://127.0.0.1:7100
 //! ```
 //!
-//! `MAGEX_TOKEN` holds a bearer token if the service wants one, `MAGEX_TLS_CA` names the authority of an https service.
+//! `MAGEX_TOKEN` holds a bearer token if the service wants one. `MAGEX_TLS_CA` names the authority of an https service, and
+//! `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` the client's own certificate and key if it wants one (PEM files).
 #![allow(clippy::print_stdout, reason = "an example talks")]
 
 use anyhow::Context as _;
@@ -15,20 +16,24 @@ use magex_proto::v1::{
     Positions, UpdateMissionRequest, WatchAssignmentsRequest, WatchKind,
 };
 use tonic::metadata::{Ascii, MetadataValue};
-use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
+use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Request, Status};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let url = std::env::args().nth(1).unwrap_or_else(|| "http://127.0.0.1:7100".to_owned());
     let mut endpoint = Endpoint::from_shared(url.clone())?.connect_timeout(std::time::Duration::from_secs(3));
-    if let Some(path) = std::env::var_os("MAGEX_TLS_CA") {
-        let ca = Certificate::from_pem(std::fs::read(path)?);
-        endpoint = endpoint.tls_config(ClientTlsConfig::new().ca_certificate(ca))?;
+    if let Some(ca) = file("MAGEX_TLS_CA")? {
+        let mut tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(ca));
+        if let Some((certificate, key)) = file("MAGEX_TLS_CERT")?.zip(file("MAGEX_TLS_KEY")?) {
+            tls = tls.identity(Identity::from_pem(certificate, key));
+        }
+        endpoint = endpoint.tls_config(tls)?;
     }
     let channel = endpoint.connect().await.with_context(|| format!("no commander at {url}"))?;
-    let token = std::env::var("MAGEX_TOKEN").ok();
-    let bearer: Option<MetadataValue<Ascii>> = token.map(|token| format!("Bearer {token}").parse()).transpose()?;
+    let token = std::env::var("MAGEX_TOKEN").ok().filter(|token| !token.trim().is_empty());
+    let bearer: Option<MetadataValue<Ascii>> =
+        token.map(|token| format!("Bearer {}", token.trim()).parse()).transpose()?;
     let mut client = CommanderServiceClient::with_interceptor(channel, move |mut request: Request<()>| {
         if let Some(bearer) = &bearer {
             request.metadata_mut().insert("authorization", bearer.clone());
@@ -86,6 +91,12 @@ async fn main() -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+/// The file that a variable of the environment names.
+fn file(variable: &str) -> anyhow::Result<Option<Vec<u8>>> {
+    let path = std::env::var_os(variable).filter(|path| !path.is_empty());
+    path.map(|path| std::fs::read(&path).with_context(|| format!("{variable}: {}", path.display()))).transpose()
 }
 
 fn show(assignment: &Assignment) {

@@ -30,6 +30,7 @@ pub struct Service {
     name: String,
     arguments: Vec<String>,
     log: PathBuf,
+    awaited: bool,
 }
 
 /// A running service.
@@ -51,10 +52,16 @@ impl Service {
     /// The command line `magex <arguments>`; standard error is appended to `<name>.log` in `logs`.
     pub fn new(name: &str, arguments: &[&str], logs: &Path) -> Self {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")) }
+        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")), awaited: true }
     }
 
-    /// Starts it and waits until it is ready.
+    /// Its start does not wait for the ready line: an actor's comes when a learner has accepted it.
+    #[must_use]
+    pub(crate) fn unawaited(self) -> Self {
+        Self { awaited: false, ..self }
+    }
+
+    /// Starts it and waits until it is ready, unless it is not awaited.
     pub async fn start(&self) -> anyhow::Result<Running> {
         let open = || OpenOptions::new().create(true).append(true).open(&self.log);
         let log = open().with_context(|| self.log.display().to_string())?;
@@ -80,6 +87,9 @@ impl Service {
         let (stdout, stdin) = (child.stdout.take(), child.stdin.take());
         let (name, log) = (self.name.clone(), self.log.clone());
         let mut running = Running { name, child, _stdin: stdin, log, log_start, address: String::new(), http: None };
+        if !self.awaited {
+            return Ok(running);
+        }
         let ready = async {
             let mut lines = BufReader::new(stdout?).lines();
             let line = lines.next_line().await.ok()??;
