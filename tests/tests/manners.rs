@@ -127,7 +127,7 @@ fn the_command_line_says_what_is_at_an_address() {
     let assign = |rest: &str| format!("assign --random 2 --scheduler exact --connect {rest}");
     for (rest, words) in [
         (format!("http://{address}"), "wants TLS; use https://"),
-        (format!("http://{page}"), "a web server answers at"),
+        (format!("http://{page}"), "a web server"),
         (format!("https://{plain} --tls-ca @one.pem"), "answers without TLS: use http://"),
         (format!("https://{address} --tls-ca @two.pem"), "is not of the CA in"),
         (format!("https://{mutual} --tls-ca @one.pem"), "wants a client certificate: give --tls-cert and --tls-key"),

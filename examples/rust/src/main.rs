@@ -9,6 +9,8 @@
 //! `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` the client's own certificate and key if it wants one (PEM files).
 #![allow(clippy::print_stdout, reason = "an example talks")]
 
+mod connect;
+
 use anyhow::Context as _;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::v1::{
@@ -16,21 +18,12 @@ use magex_proto::v1::{
     Positions, UpdateMissionRequest, WatchAssignmentsRequest, WatchKind,
 };
 use tonic::metadata::{Ascii, MetadataValue};
-use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Request, Status};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let url = std::env::args().nth(1).unwrap_or_else(|| "http://127.0.0.1:7100".to_owned());
-    let mut endpoint = Endpoint::from_shared(url.clone())?.connect_timeout(std::time::Duration::from_secs(3));
-    if let Some(ca) = file("MAGEX_TLS_CA")? {
-        let mut tls = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(ca));
-        if let Some((certificate, key)) = file("MAGEX_TLS_CERT")?.zip(file("MAGEX_TLS_KEY")?) {
-            tls = tls.identity(Identity::from_pem(certificate, key));
-        }
-        endpoint = endpoint.tls_config(tls)?;
-    }
-    let channel = endpoint.connect().await.with_context(|| format!("no commander at {url}"))?;
+    let channel = connect::to(&url).await?;
     let token = std::env::var("MAGEX_TOKEN").ok().filter(|token| !token.trim().is_empty());
     let bearer: Option<MetadataValue<Ascii>> =
         token.map(|token| format!("Bearer {}", token.trim()).parse()).transpose()?;
@@ -91,12 +84,6 @@ async fn main() -> anyhow::Result<()> {
         }
     }
     Ok(())
-}
-
-/// The file that a variable of the environment names.
-fn file(variable: &str) -> anyhow::Result<Option<Vec<u8>>> {
-    let path = std::env::var_os(variable).filter(|path| !path.is_empty());
-    path.map(|path| std::fs::read(&path).with_context(|| format!("{variable}: {}", path.display()))).transpose()
 }
 
 fn show(assignment: &Assignment) {
