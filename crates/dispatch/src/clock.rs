@@ -75,7 +75,10 @@ impl Clock {
     pub fn resume(mark: Option<Mark>) -> Self {
         let now = Mark { clock_ms: 0, boot_ms: since_boot(), boot: this_boot(), day_ms: time_of_day() };
         let clock = mark.map_or(now.day_ms, |mark| mark.advanced_to(&now));
-        Self { offset: clock - now.boot_ms, boot: now.boot, day: AtomicI64::new(now.day_ms - clock) }
+        let real = now.day_ms - clock;
+        // Without a jump, clients see the same times as before.
+        let known = mark.map(|mark| mark.day_ms - mark.clock_ms).filter(|known| (known - real).abs() <= JUMP);
+        Self { offset: clock - now.boot_ms, boot: now.boot, day: AtomicI64::new(known.unwrap_or(real)) }
     }
 
     /// The moment now, and by how much the time of day has jumped since the last call, milliseconds.
@@ -90,8 +93,8 @@ impl Clock {
 
     /// The clock, to be written down.
     pub fn mark(&self) -> Mark {
-        let boot_ms = since_boot();
-        Mark { clock_ms: boot_ms + self.offset, boot_ms, boot: self.boot, day_ms: time_of_day() }
+        let (now, _) = self.now();
+        Mark { clock_ms: now.clock_ms, boot_ms: now.clock_ms - self.offset, boot: self.boot, day_ms: now.day_ms }
     }
 }
 
@@ -144,6 +147,10 @@ mod tests {
         let (now, jump) = Clock::resume(Some(mark)).now();
         assert!((12_345..12_345 + HOUR).contains(&now.clock_ms) && jump.is_none(), "{now:?}");
         assert!((now.day_ms - time_of_day()).abs() < HOUR);
+        // Over a restart without a jump, what is shown does not change.
+        let (before, _) = first.now();
+        let (after, _) = Clock::resume(Some(first.mark())).now();
+        assert_eq!(after.day_of(0), before.day_of(0));
         assert_eq!(Now { clock_ms: 10, day_ms: 1010 }.day_of(25), 1025);
     }
 }
