@@ -14,6 +14,7 @@ use magex_runtime::service::{self, ServiceArgs};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
+use tokio_util::sync::CancellationToken;
 
 /// Options of an actor. None of them can change a number of the run.
 #[derive(Debug, Clone, Args, Serialize)]
@@ -58,8 +59,14 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
     let config = configure(&args)?;
     let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
-        context.announce(http::routes(metrics.clone()));
-        run::run(config, PolicyWorker::maker(), metrics, context.stop).await.map_err(|error| match &error {
+        context.serve_page(http::routes(metrics.clone()));
+        context.reload(config.client.sources(), &metrics);
+        let (accepted, stop) = (config.accepted.clone(), context.stop.clone());
+        tokio::spawn(async move {
+            accepted.cancelled().await;
+            context.announce();
+        });
+        run::run(config, PolicyWorker::maker(), metrics, stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
             ActorError::Evicted(..) => Failure::new(exit::INTERNAL, &error),
@@ -87,5 +94,6 @@ fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
         threads: args.threads,
         expected_task: args.config.as_ref().map(fingerprint).transpose()?,
         stay: args.stay,
+        accepted: CancellationToken::new(),
     })
 }

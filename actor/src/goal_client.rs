@@ -6,7 +6,9 @@ use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::backoff::Backoff;
 use magex_runtime::client::Channel;
+use magex_runtime::peer::{Complaints, Remote};
 use magex_runtime::{status, trace};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
@@ -42,6 +44,7 @@ pub enum GoalError {
 #[derive(Debug)]
 pub struct GrpcGoals {
     runtime: Handle,
+    commander: Arc<Remote>,
     client: CommanderServiceClient<Channel>,
     weights: WeightsKey,
     patience: Duration,
@@ -55,16 +58,16 @@ impl GrpcGoals {
     /// trace of `parent`.
     pub(crate) fn new(
         runtime: Handle,
-        channel: Channel,
+        commander: (Arc<Remote>, Channel),
         weights: WeightsKey,
         patience: Duration,
         cancelled: CancellationToken,
         parent: Span,
     ) -> Self {
-        let client = CommanderServiceClient::new(channel)
+        let client = CommanderServiceClient::new(commander.1)
             .max_decoding_message_size(MAX_BATCH_BYTES)
             .max_encoding_message_size(MAX_BATCH_BYTES);
-        Self { runtime, client, weights, patience, cancelled, waited: Duration::ZERO, parent }
+        Self { runtime, commander: commander.0, client, weights, patience, cancelled, waited: Duration::ZERO, parent }
     }
 
     /// Total time that callers have waited for goals.
@@ -77,10 +80,12 @@ impl GrpcGoals {
         let message = request.to_message(&self.weights);
         let span = tracing::info_span!(target: trace::TARGET, parent: &self.parent, "goals");
         let asked = Instant::now();
-        let (patience, client) = (self.patience, &mut self.client);
+        let (patience, commander, client) = (self.patience, &self.commander, &mut self.client);
         let answer = self.runtime.block_on(self.cancelled.run_until_cancelled(async {
             // The timer must be made within the runtime.
-            tokio::time::timeout(patience, ask(client, message, &span)).await.map_err(|_| GoalError::Late(patience))?
+            tokio::time::timeout(patience, ask(commander, client, message, &span))
+                .await
+                .map_err(|_| GoalError::Late(patience))?
         }));
         self.waited += asked.elapsed();
         let answer = answer.ok_or(GoalError::Cancelled)??;
@@ -89,12 +94,14 @@ impl GrpcGoals {
 }
 
 async fn ask(
+    commander: &Remote,
     client: &mut CommanderServiceClient<Channel>,
     message: v1::AssignBatchRequest,
     span: &Span,
 ) -> Result<v1::AssignBatchResponse, GoalError> {
     let mut backoff = Backoff::default();
     let mut failures = 0u32;
+    let mut complaints = Complaints::default();
     loop {
         let mut request = Request::new(message.clone());
         trace::add_to(request.metadata_mut(), span);
@@ -106,7 +113,7 @@ async fn ask(
                 }
                 return Ok(response.into_inner());
             }
-            Ok(Err(status)) if is_transient(&status) => status.message().to_owned(),
+            Ok(Err(status)) if is_transient(&status) => status,
             Ok(Err(status)) => {
                 return Err(match status.code() {
                     Code::Unauthenticated | Code::PermissionDenied => {
@@ -115,11 +122,12 @@ async fn ask(
                     code => GoalError::Refused(format!("{code}: {}", status.message())),
                 });
             }
-            Err(_) => "no answer in time".to_owned(),
+            Err(_) => Status::deadline_exceeded("no answer in time"),
         };
         failures += 1;
-        if failures == 1 {
-            tracing::warn!(reason = problem, "the commander does not answer; retrying");
+        let problem = commander.explain(&problem).await;
+        if complaints.due(&problem) {
+            tracing::warn!(reason = problem.text, url = commander.url, "the commander does not answer; retrying");
         }
         tokio::time::sleep(backoff.next_wait()).await;
     }

@@ -11,6 +11,7 @@ use magex_core::task::TaskConfig;
 use magex_proto::convert::encode_result;
 use magex_proto::v1::{ShardTiming, Welcome};
 use magex_runtime::client::Channel;
+use magex_runtime::peer::Remote;
 use magex_runtime::sync::lock;
 use magex_runtime::trace;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -54,7 +55,8 @@ pub(crate) struct EncodedResult {
 pub(crate) struct PoolContext {
     pub(crate) make_worker: MakeWorker,
     pub(crate) cache: Arc<WeightsCache>,
-    pub(crate) commander: Channel,
+    pub(crate) channel: Channel,
+    pub(crate) commander: Arc<Remote>,
     pub(crate) runtime: Handle,
     pub(crate) metrics: Arc<ActorMetrics>,
 }
@@ -190,7 +192,8 @@ impl RolloutThread {
         let run_id = RunId(self.welcome.run_id.clone());
         let sha256 = leased.weights_sha256.clone();
         let key = WeightsKey { run_id: run_id.clone(), version: leased.shard.version, sha256 };
-        let (runtime, commander) = (self.context.runtime.clone(), self.context.commander.clone());
+        let context = &self.context;
+        let (runtime, commander) = (context.runtime.clone(), (context.commander.clone(), context.channel.clone()));
         let arrival = self.context.cache.wait(&key, self.lease);
         let arrived = runtime.block_on(self.cancelled.run_until_cancelled(arrival));
         let cancelled = || WorkError::Retryable(GoalError::Cancelled.to_string());

@@ -8,16 +8,18 @@ use crate::weights_cache::{self, WeightsCache};
 use crate::worker::{MakeWorker, WorkError};
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_proto::v1::rollout_request::Message as Request;
-use magex_proto::{MAX_MESSAGE_BYTES, PROTOCOL_VERSION, v1};
+use magex_proto::{COMMANDER, LEARNER, MAX_MESSAGE_BYTES, PROTOCOL_VERSION, SERVICES, v1};
 use magex_runtime::backoff::{Backoff, random_id};
 use magex_runtime::client::{Channel, Settings};
 use magex_runtime::exit::Failure;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::peer::{Complaints, Remote};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
 
 /// The learner answers a hello within this time, or the actor reconnects.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(10);
@@ -42,6 +44,8 @@ pub struct ActorConfig {
     pub expected_task: Option<String>,
     /// Wait for another run after this one is complete.
     pub stay: bool,
+    /// Cancelled when a learner has accepted the actor for the first time.
+    pub accepted: CancellationToken,
 }
 
 /// Why an actor ended.
@@ -79,17 +83,27 @@ pub async fn run(
         return Err(ActorError::NoThreads);
     }
     let cache = Arc::new(WeightsCache::default());
-    let commander = config.client.lazy_channel(&config.commander_url)?;
+    let remote =
+        |url: &str, wanted| Remote { url: url.to_owned(), settings: config.client.clone(), wanted, known: &SERVICES };
+    let (learner, commander) = (remote(&config.learner_url, LEARNER), remote(&config.commander_url, COMMANDER));
     let runtime = tokio::runtime::Handle::current();
     // Two connections: results never delay weights.
     let metrics = Arc::new(ActorMetrics::new(&metrics));
-    let feed = config.client.lazy_channel(&config.learner_url)?;
+    let feed = learner.channel()?;
     let feed = tokio::spawn(weights_cache::follow(feed, config.actor_id.clone(), cache.clone(), metrics.clone()));
-    let context = PoolContext { make_worker, cache, commander, runtime, metrics };
-    let bulk = config.client.lazy_channel(&config.learner_url)?;
+    let context = PoolContext {
+        make_worker,
+        cache,
+        channel: commander.channel()?,
+        commander: Arc::new(commander),
+        runtime,
+        metrics,
+    };
+    let bulk = learner.channel()?;
     let mut actor = Actor {
         config,
         context,
+        learner,
         bulk,
         process_id: random_id(),
         pool: None,
@@ -107,6 +121,7 @@ pub async fn run(
 struct Actor {
     config: ActorConfig,
     context: PoolContext,
+    learner: Remote,
     bulk: Channel,
     process_id: u64,
     pool: Option<RolloutPool>,
@@ -117,12 +132,12 @@ struct Actor {
 impl Actor {
     async fn run(&mut self, shutdown: &CancellationToken) -> Result<(), ActorError> {
         let mut backoff = Backoff::default();
-        let mut waiting = false;
+        let (mut waiting, mut complaints) = (false, Complaints::default());
         loop {
             let sessions = self.report.sessions;
             let end = self.session(shutdown).await?;
             if self.report.sessions > sessions {
-                (backoff, waiting) = (Backoff::default(), false);
+                (backoff, waiting, complaints) = (Backoff::default(), false, Complaints::default());
             }
             match end {
                 SessionEnd::Shutdown => return Ok(()),
@@ -142,16 +157,20 @@ impl Actor {
                     return Err(ActorError::Evicted(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Unusable(error) => return Err(ActorError::Unusable(error)),
-                SessionEnd::Broken(reason) if waiting => tracing::debug!(reason, "no learner yet"),
-                SessionEnd::Broken(reason) => {
-                    tracing::warn!(reason, url = self.config.learner_url, "no learner; retrying");
-                    waiting = true;
-                }
+                SessionEnd::Broken(reason) => self.complain(&Status::unavailable(reason), &mut complaints).await,
+                SessionEnd::Failed(status) => self.complain(&status, &mut complaints).await,
             }
             let pause = tokio::time::sleep(backoff.next_wait());
             if shutdown.run_until_cancelled(pause).await.is_none() {
                 return Ok(());
             }
+        }
+    }
+
+    async fn complain(&self, status: &Status, complaints: &mut Complaints) {
+        let problem = self.learner.explain(status).await;
+        if complaints.due(&problem) {
+            tracing::warn!(reason = problem.text, url = self.learner.url, "no learner; retrying");
         }
     }
 
@@ -180,6 +199,7 @@ impl Actor {
         let metrics = self.context.metrics.clone();
         metrics.reconnects.inc_by(u64::from(self.report.sessions > 1));
         let pool = self.pool_for(welcome, lease).await?;
+        self.config.accepted.cancel();
         metrics.connected.set(1.0);
         let session =
             Session::new(self.pool.insert(pool), &mut self.unacknowledged, &mut self.report, &metrics, outbound);

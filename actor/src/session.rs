@@ -25,6 +25,8 @@ pub(crate) enum SessionEnd {
     Finished,
     /// The connection failed: reconnect.
     Broken(String),
+    /// A call failed with this status: reconnect.
+    Failed(Status),
     /// The learner rejects this actor; reconnecting would not help.
     Refused(String),
     /// The learner evicted this process: its results are invalid, or its shards fail.
@@ -41,7 +43,7 @@ impl From<Status> for SessionEnd {
             Code::FailedPrecondition | Code::InvalidArgument | Code::Unauthenticated | Code::PermissionDenied => {
                 Self::Refused(status.message().to_owned())
             }
-            code => Self::Broken(format!("{code}: {}", status.message())),
+            _ => Self::Failed(status),
         }
     }
 }

@@ -3,7 +3,7 @@
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::error::to_status;
-use crate::mission_service::{self, MissionService, now_ms};
+use crate::mission_service::{self, MissionService};
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, GoalRequest};
 use crate::shard_assign::{self, ShardAssign};
@@ -13,9 +13,11 @@ use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_proto::v1::commander_service_server::CommanderService;
 use magex_runtime::net::auth::{Role, caller};
+use magex_runtime::net::heartbeat::Heartbeat;
 use magex_runtime::net::in_flight::{CallKind, InFlight};
 use magex_runtime::{status, trace};
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -40,6 +42,8 @@ pub(crate) struct CommanderApi {
     pub(crate) in_flight: Arc<InFlight>,
     pub(crate) limits: Limits,
     pub(crate) draining: CancellationToken,
+    /// Time between heartbeats on streams.
+    pub(crate) heartbeat: Option<Duration>,
 }
 
 impl CommanderApi {
@@ -77,8 +81,8 @@ impl CommanderService for CommanderApi {
         caller(&request, CLIENT)?;
         let budget = budget(&request);
         let teams = request.into_inner().teams;
-        if teams.is_empty() || teams.len() > self.limits.teams {
-            let problem = format!("{} teams; send 1 to {}", teams.len(), self.limits.teams);
+        if teams.len() > self.limits.teams {
+            let problem = format!("{} teams exceed the limit of {}", teams.len(), self.limits.teams);
             return Err(status::invalid_argument("teams", problem));
         }
         let read = |(k, team)| {
@@ -102,8 +106,8 @@ impl CommanderService for CommanderApi {
         caller(&request, CLIENT)?;
         let (answers, stream) = mpsc::channel(streams::AHEAD);
         let (answering, in_flight, draining) = (self.answering.clone(), self.in_flight.clone(), self.draining.clone());
-        let teams = request.into_inner();
-        tokio::spawn(streams::assign(answering, in_flight, self.limits, teams, answers, draining));
+        let (teams, beat) = (request.into_inner(), Heartbeat::new(self.heartbeat));
+        tokio::spawn(streams::assign(answering, in_flight, self.limits, teams, answers, draining, beat));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 
@@ -120,7 +124,7 @@ impl CommanderService for CommanderApi {
         let (reply, method) = answer.instrument(span).await?;
         self.answering.metrics.answered(method, false, budget.elapsed());
         let message = reply.to_message(&request, version);
-        self.missions.record(TrainingShard { request, reply, key, method, at_ms: now_ms() });
+        self.missions.record(TrainingShard { request, reply, key, method, at: self.missions.now() });
         Ok(Response::new(message))
     }
 
@@ -166,7 +170,8 @@ impl CommanderService for CommanderApi {
         let source = mission_service::source(request.source)?;
         let interest = Interest { caller, ids: request.mission_ids.into_iter().collect(), source };
         let (watcher, stream) = mpsc::channel(streams::AHEAD);
-        tokio::spawn(streams::watch(self.missions.clone(), interest, watcher, self.draining.clone()));
+        let beat = Heartbeat::new(self.heartbeat);
+        tokio::spawn(streams::watch(self.missions.clone(), interest, watcher, self.draining.clone(), beat));
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 

@@ -1,7 +1,7 @@
 //! The commander's command line.
 
 use crate::run_scheduler::load_scheduler;
-use crate::service::{ServiceConfig, run as serve};
+use crate::service::{ServiceConfig, run_and_tell as serve};
 use crate::weights_file::WeightsFile;
 use clap::Args;
 use magex_dispatch::Limits;
@@ -106,6 +106,7 @@ impl CommanderArgs {
                 ..Bounds::default()
             },
             drain: Duration::from_millis(u64::from(self.drain)),
+            heartbeat: self.security.heartbeat(),
             metrics: Arc::new(Metrics::new()),
         })
     }
@@ -122,9 +123,13 @@ pub fn run(args: CommanderArgs) -> Result<u8, Failure> {
     }
     let config = args.config()?;
     service::main("commander", 2, &args.service, async |mut context| {
-        let (incoming, _) = context.listen(&args.listen, args.security.connections()).await?;
-        context.announce(http::routes(config.metrics.clone()));
-        serve(config, load_scheduler, incoming, context.stop).await
+        let (incoming, address) = context.listen(&args.listen, args.security.connections()).await?;
+        context.serve_page(http::routes(config.metrics.clone()));
+        let sources = config.security.sources().into_iter().chain(config.client.sources());
+        context.reload(sources.collect(), &config.metrics);
+        tracing::info!(%address, "listening");
+        let stop = context.stop.clone();
+        serve(config, load_scheduler, incoming, stop, move || context.announce()).await
     })?;
     Ok(exit::OK)
 }

@@ -6,6 +6,7 @@ use crate::cancel::{Work, on_thread};
 use crate::error::to_status;
 use crate::training_view::{TrainingShard, TrainingView};
 use magex_dispatch::answer::Planned;
+use magex_dispatch::clock::Now;
 use magex_dispatch::mission::Mission;
 use magex_dispatch::missions::{KeepError, Missions, passes};
 use magex_dispatch::{AssignError, Problem};
@@ -15,7 +16,6 @@ use magex_runtime::net::auth::{Caller, Role};
 use magex_runtime::status;
 use magex_runtime::sync::lock;
 use std::sync::{Arc, Mutex};
-use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::sync::broadcast;
 use tonic::Status;
 
@@ -48,19 +48,20 @@ pub(crate) struct MissionService {
     order: Mutex<()>,
 }
 
-/// Milliseconds since 1970: missions outlive the process, and their ages with them.
-#[allow(
-    clippy::disallowed_methods,
-    reason = "the creation time of a mission is shown to clients and kept across restarts"
-)]
-pub(crate) fn now_ms() -> i64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
-}
-
 impl MissionService {
     pub(crate) fn new(missions: Missions, answering: Arc<AssignService>) -> Arc<Self> {
         let (training, events) = (TrainingView::default(), broadcast::Sender::new(BACKLOG));
         Arc::new(Self { missions, training, answering, events, order: Mutex::default() })
+    }
+
+    /// The moment, on the clock of missions and for clients.
+    pub(crate) fn now(&self) -> Now {
+        let (now, jump) = self.missions.clock.now();
+        if let Some(ms) = jump {
+            let seconds = ms as f64 / 1e3;
+            tracing::warn!(seconds, "the time of day has jumped; missions keep their lifetimes");
+        }
+        now
     }
 
     pub(crate) async fn create(
@@ -73,7 +74,7 @@ impl MissionService {
         let (own, places) = (self.clone(), self.answering.places(cells, budget.left()).await?);
         on_thread(places, budget, move |work| {
             own.missions.check_room(&caller.name).map_err(to_status)?;
-            let (now, each) = (now_ms(), own.missions.bounds.each);
+            let (now, each) = (own.now(), own.missions.bounds.each);
             let drawn = format!("m-{:016x}", random_id());
             let planner = own.planner(work);
             let mission = Mission::create(request, &caller.name, &drawn, now, &each, &planner).map_err(to_status)?;
@@ -123,7 +124,7 @@ impl MissionService {
                 return Ok(None);
             }
             let (each, again) = (own.missions.bounds.each, request.expected_revision.is_none() && !last);
-            let next = before.update(request, now_ms(), &each, &own.planner(work)).map_err(to_status)?;
+            let next = before.update(request, own.now(), &each, &own.planner(work)).map_err(to_status)?;
             check(work)?;
             match own.change(v1::WatchKind::Changed, || own.missions.replace(next, was)) {
                 Err(KeepError::Changed { .. }) if again => Ok(None),
@@ -136,7 +137,8 @@ impl MissionService {
     pub(crate) async fn delete(self: &Arc<Self>, caller: Caller, id: String) -> Result<(), Status> {
         let own = self.clone();
         let deleting = tokio::task::spawn_blocking(move || {
-            let may = |mission: &Mission| visible(&caller, mission, now_ms());
+            let now = own.now();
+            let may = |mission: &Mission| visible(&caller, mission, &now);
             match own.change(v1::WatchKind::Deleted, || own.missions.remove(&id, may)) {
                 Err(KeepError::Missing(_)) => Err(own.absent(&id)),
                 result => result.map(drop).map_err(to_status),
@@ -146,9 +148,9 @@ impl MissionService {
     }
 
     pub(crate) fn get(&self, caller: &Caller, id: &str) -> Result<v1::Assignment, Status> {
-        let now = now_ms();
-        let own = self.missions.get(id).filter(|mission| visible(caller, mission, now));
-        let found = own.map(|mission| mission.assignment.clone()).or_else(|| self.training.get(id, now));
+        let now = self.now();
+        let own = self.missions.get(id).filter(|mission| visible(caller, mission, &now));
+        let found = own.map(|mission| mission.shown(&now)).or_else(|| self.training.get(id, &now));
         found.ok_or_else(|| missing(id))
     }
 
@@ -176,11 +178,11 @@ impl MissionService {
         count: usize,
         filter: v1::MissionSource,
     ) -> (Vec<v1::Assignment>, bool) {
-        let now = now_ms();
+        let now = self.now();
         // One more tells whether there is another page.
-        let missions = || self.missions.page(name, count + 1, |mission| visible(caller, mission, now));
+        let missions = || self.missions.page(name, count + 1, |mission| visible(caller, mission, &now));
         let missions = passes(filter, v1::MissionSource::Client).then(missions).unwrap_or_default();
-        let episodes = || self.training.page(name, count + 1, now);
+        let episodes = || self.training.page(name, count + 1, &now);
         let episodes = passes(filter, v1::MissionSource::Training).then(episodes).unwrap_or_default();
         let (mut missions, mut episodes) = (missions.iter().peekable(), episodes.iter().peekable());
         let (mut found, mut bytes) = (Vec::new(), 0);
@@ -191,7 +193,7 @@ impl MissionService {
                 (mission, _) => mission.is_some(),
             };
             let assignment = match client_first {
-                true => missions.next().map(|mission| mission.assignment.clone()),
+                true => missions.next().map(|mission| mission.shown(&now)),
                 false => episodes.next().and_then(|(_, shard, place)| shard.assignment(*place)),
             };
             // An inconsistent episode is skipped.
@@ -217,7 +219,7 @@ impl MissionService {
         let own = self.clone();
         let sweeping = move || {
             let _order = lock(&own.order);
-            let old = own.missions.expire(now_ms())?;
+            let old = own.missions.expire(own.now())?;
             old.into_iter().for_each(|mission| drop(own.publish(v1::WatchKind::Expired, mission)));
             Ok::<(), KeepError>(())
         };
@@ -225,6 +227,16 @@ impl MissionService {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::error!(%error, "expired missions cannot be deleted"),
             Err(error) => tracing::error!(%error, "expired missions cannot be deleted"),
+        }
+    }
+
+    /// Writes the clock of the missions down.
+    pub(crate) async fn note_time(self: &Arc<Self>) {
+        let own = self.clone();
+        match tokio::task::spawn_blocking(move || own.missions.note_time()).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!(%error, "the time cannot be written to the file of the missions"),
+            Err(error) => tracing::warn!(%error, "the time cannot be written to the file of the missions"),
         }
     }
 
@@ -247,14 +259,14 @@ impl MissionService {
 
     /// A mission that this caller may change.
     fn writable(&self, caller: &Caller, id: &str) -> Result<Arc<Mission>, Status> {
-        let now = now_ms();
-        let found = self.missions.get(id).filter(|mission| visible(caller, mission, now));
+        let now = self.now();
+        let found = self.missions.get(id).filter(|mission| visible(caller, mission, &now));
         found.ok_or_else(|| self.absent(id))
     }
 
     /// Why a caller may not change a mission: the same status whether it belongs to another client or does not exist.
     fn absent(&self, id: &str) -> Status {
-        match self.training.get(id, now_ms()) {
+        match self.training.get(id, &self.now()) {
             Some(_) => status::failed_precondition(format!("'{id}' is an episode of a training run: read only")),
             None => missing(id),
         }
@@ -288,9 +300,9 @@ fn learned(scheduler: i32) -> bool {
 }
 
 /// Whether a mission is visible to a caller.
-pub(crate) fn visible(caller: &Caller, mission: &Mission, now: i64) -> bool {
+pub(crate) fn visible(caller: &Caller, mission: &Mission, now: &Now) -> bool {
     let own = caller.role == Role::Admin || mission.assignment.owner == *caller.name;
-    own && mission.assignment.expires_ms > now
+    own && !mission.expired(now)
 }
 
 pub(crate) fn source(value: i32) -> Result<v1::MissionSource, Status> {

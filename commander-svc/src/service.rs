@@ -12,14 +12,15 @@ use crate::weights_file::WeightsFile;
 use magex_dispatch::Limits;
 use magex_dispatch::disk::Disk;
 use magex_dispatch::missions::{Bounds, Missions};
-use magex_proto::v1::commander_service_server::CommanderServiceServer;
-use magex_proto::{FILE_DESCRIPTOR_SET, MAX_BATCH_BYTES};
+use magex_proto::v1::commander_service_server::{CommanderServiceServer, SERVICE_NAME};
+use magex_proto::{FILE_DESCRIPTOR_SET, LEARNER, MAX_BATCH_BYTES, SERVICES};
 use magex_runtime::client::Settings;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::Health;
 use magex_runtime::metrics::Metrics;
 use magex_runtime::net::guard::{Guard, Rules};
 use magex_runtime::net::in_flight::{CallKind, InFlight, InFlightLimits};
+use magex_runtime::peer::Remote;
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
 use std::fmt::Display;
@@ -31,6 +32,8 @@ use tokio_util::sync::CancellationToken;
 
 /// How often expired missions are deleted.
 const SWEEP: Duration = Duration::from_secs(2);
+/// Number of these after which the clock of missions is written down, if no change does.
+const NOTE: u64 = 30;
 /// Bytes of requests in flight: of one caller, and of all callers.
 const CALLER_BYTES: usize = 64 << 20;
 const BYTES: usize = 256 << 20;
@@ -62,6 +65,8 @@ pub struct ServiceConfig {
     pub missions: Bounds,
     /// How long a stopping service rejects calls with UNAVAILABLE before it closes its port.
     pub drain: Duration,
+    /// Time between heartbeats on streams; `None` for none.
+    pub heartbeat: Option<Duration>,
     /// Its metrics.
     pub metrics: Arc<Metrics>,
 }
@@ -80,6 +85,7 @@ impl Default for ServiceConfig {
             streams: 16,
             missions: Bounds::default(),
             drain: Duration::ZERO,
+            heartbeat: None,
             metrics: Arc::default(),
         }
     }
@@ -93,14 +99,28 @@ impl ServiceConfig {
     }
 }
 
-/// Serves until `shutdown`, then drains for `config.drain` and returns within [`server::GRACE`] more. The health is SERVING once
-/// a model is loaded, or at once if neither a learner nor weights are configured.
+/// [`run_and_tell`] without a listener for readiness.
 pub async fn run(
     config: ServiceConfig,
     load_scheduler: LoadScheduler,
     incoming: Incoming,
     shutdown: CancellationToken,
 ) -> Result<(), Failure> {
+    run_and_tell(config, load_scheduler, incoming, shutdown, || ()).await
+}
+
+/// Serves until `shutdown`, then drains for `config.drain` and returns within [`server::GRACE`] more. The health is SERVING once
+/// a model is loaded, or at once if neither a learner nor weights are configured. `ready` is called once everything that was
+/// configured is open: files, weights, and the learner's first weights.
+pub async fn run_and_tell(
+    config: ServiceConfig,
+    load_scheduler: LoadScheduler,
+    incoming: Incoming,
+    shutdown: CancellationToken,
+    ready: impl FnOnce() + Send + 'static,
+) -> Result<(), Failure> {
+    // The folder first: it is checked at once, and weights may take a while.
+    let missions = open_missions(config.data.clone(), config.missions).await?;
     let store = Arc::new(ModelStore::new());
     let without_model = config.learner_url.is_none() && config.weights.is_none();
     let draining = CancellationToken::new();
@@ -109,20 +129,24 @@ pub async fn run(
     let mut helpers = JoinSet::new();
     if let Some(file) = config.weights {
         let loaded =
-            file.first(&store, load_scheduler).await.map_err(|error| Failure::usage(format!("weights: {error}")))?;
+            file.first(&store, load_scheduler).await.map_err(|error| Failure::usage(format!("--weights: {error}")))?;
         helpers.spawn(file.follow(loaded, store.clone(), load_scheduler));
     }
     if let Some(url) = &config.learner_url {
-        let channel = config.client.lazy_channel(url).map_err(|error| Failure::usage(format!("learner: {error}")))?;
-        helpers.spawn(subscription::follow(channel, store.clone(), load_scheduler));
+        let learner = Remote { url: url.clone(), settings: config.client.clone(), wanted: LEARNER, known: &SERVICES };
+        let channel = learner.channel().map_err(|error| Failure::usage(format!("--learner: {error}")))?;
+        helpers.spawn(subscription::follow(learner, channel, store.clone(), load_scheduler));
     }
     let metrics = Arc::new(CommanderMetrics::new(&config.metrics));
     let answering = AssignService::new(store.clone(), metrics.clone());
-    let missions = MissionService::new(open_missions(config.data, config.missions).await?, answering.clone());
+    let missions = MissionService::new(missions, answering.clone());
     let (sweeper, closer) = (missions.clone(), missions.clone());
     helpers.spawn(async move {
-        loop {
+        for sweep in 1u64.. {
             sweeper.sweep().await;
+            if sweep % NOTE == 0 {
+                sweeper.note_time().await;
+            }
             tokio::time::sleep(SWEEP).await;
         }
     });
@@ -134,6 +158,7 @@ pub async fn run(
         in_flight: in_flight.clone(),
         limits: config.limits,
         draining: draining.clone(),
+        heartbeat: config.heartbeat,
     });
     let weak = Arc::downgrade(&api);
     config.metrics.before_scrape(move || {
@@ -156,17 +181,17 @@ pub async fn run(
     };
     let internal =
         |what: &str, error: &dyn Display| Failure::new(exit::INTERNAL, format!("the commander's {what}: {error}"));
-    let router = server::secure_builder(tls.as_ref())
-        .map_err(|error| Failure::usage(format!("tls: {error}")))?
+    let router = server::builder()
         .add_service(Guard::public(health_service, connections.clone()))
         .add_service(Guard::guarded(service, rules, connections.clone()));
-    let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)
+    let router = server::with_reflection(router, SERVICE_NAME, FILE_DESCRIPTOR_SET, &connections)
         .map_err(|error| internal("reflection service cannot be built", &error))?;
     let closed = CancellationToken::new();
     let (stop, closing, drain) = (shutdown, closed.clone(), config.drain);
     helpers.spawn(async move {
         if without_model || stop.run_until_cancelled(store.ready()).await.is_some() {
             health.set(true).await;
+            ready();
             stop.cancelled().await;
         }
         // Shutdown order: report NOT_SERVING, reject new calls with UNAVAILABLE for `drain`, then close the listener.
@@ -176,7 +201,7 @@ pub async fn run(
         tracing::debug!(calls = in_flight.count(CallKind::Call), "closing the listener");
         closing.cancel();
     });
-    let served = server::serve(router, incoming, closed, server::GRACE).await;
+    let served = server::serve(router, incoming, tls, closed, server::GRACE).await;
     helpers.abort_all();
     // Dropped connections may keep the service alive for a while, but another commander may need the file.
     let _ = tokio::task::spawn_blocking(move || closer.missions.close()).await;
@@ -190,6 +215,9 @@ async fn open_missions(data: Option<PathBuf>, bounds: Bounds) -> Result<Missions
     };
     let path = match &data {
         Some(folder) => {
+            if folder.exists() && !folder.is_dir() {
+                return Err(cannot("--data", folder, &"a file; give a folder"));
+            }
             std::fs::create_dir_all(folder).map_err(|error| cannot("--data", folder, &error))?;
             folder.join(MISSIONS)
         }

@@ -3,11 +3,13 @@
 use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::error::to_status;
-use crate::mission_service::{Event, MissionService, now_ms, visible};
+use crate::mission_service::{Event, MissionService, visible};
+use magex_dispatch::clock::Now;
 use magex_dispatch::missions::passes;
 use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_runtime::net::auth::Caller;
+use magex_runtime::net::heartbeat::Heartbeat;
 use magex_runtime::net::in_flight::{InFlight, stopping};
 use magex_runtime::status;
 use std::collections::{BTreeSet, HashMap};
@@ -34,10 +36,16 @@ pub(crate) async fn assign(
     mut teams: Streaming<v1::AssignStreamRequest>,
     answers: mpsc::Sender<Result<v1::AssignStreamResponse, Status>>,
     draining: CancellationToken,
+    mut heartbeat: Heartbeat,
 ) {
     loop {
         let next = tokio::select! {
             next = teams.message() => next,
+            () = heartbeat.due() => {
+                // A queue with messages in it needs no heartbeat.
+                let _ = answers.try_send(Ok(v1::AssignStreamResponse::default()));
+                continue;
+            }
             () = draining.cancelled() => Err(stopping()),
             () = answers.closed() => return,
         };
@@ -117,6 +125,7 @@ pub(crate) async fn watch(
     interest: Interest,
     watcher: Watcher,
     draining: CancellationToken,
+    mut heartbeat: Heartbeat,
 ) {
     // Subscribes first, so that no change during the snapshot is missed.
     let mut events = missions.events.subscribe();
@@ -125,6 +134,10 @@ pub(crate) async fn watch(
     while open.is_some() {
         let event = tokio::select! {
             event = events.recv() => event,
+            () = heartbeat.due() => {
+                open = send(&watcher, v1::WatchKind::Heartbeat, None).await;
+                continue;
+            }
             () = watcher.closed() => break,
             () = draining.cancelled() => {
                 // The watcher may have cancelled, too.
@@ -133,7 +146,7 @@ pub(crate) async fn watch(
             }
         };
         open = match event {
-            Ok(event) => publish(&interest, &watcher, &mut sent, event).await,
+            Ok(event) => publish(&missions, &interest, &watcher, &mut sent, event).await,
             Err(RecvError::Lagged(missed)) => {
                 tracing::debug!(missed, watcher = &*interest.caller.name, "a slow watcher gets a new snapshot");
                 snapshot(&missions, &interest, &watcher, &mut sent).await
@@ -160,13 +173,20 @@ async fn snapshot(missions: &MissionService, interest: &Interest, watcher: &Watc
 }
 
 /// Sends an event if the watcher wants it and has not got it with a snapshot. Returns `None` if the watcher has cancelled.
-async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut Sent, event: Event) -> Option<()> {
+async fn publish(
+    missions: &MissionService,
+    interest: &Interest,
+    watcher: &Watcher,
+    sent: &mut Sent,
+    event: Event,
+) -> Option<()> {
     match event {
         Event::Mission(kind, mission) if passes(interest.source, v1::MissionSource::Client) => {
             let a = &mission.assignment;
             // The last event of a deleted or expired mission is still visible to its owner.
-            let now = if kind == v1::WatchKind::Changed { now_ms() } else { i64::MIN };
-            if !interest.wants(&a.mission_id) || !visible(&interest.caller, &mission, now) {
+            let now = missions.now();
+            let then = if kind == v1::WatchKind::Changed { now } else { Now { clock_ms: i64::MIN, ..now } };
+            if !interest.wants(&a.mission_id) || !visible(&interest.caller, &mission, &then) {
                 return Some(());
             }
             let revision = (a.created_ms, a.revision);
@@ -178,7 +198,7 @@ async fn publish(interest: &Interest, watcher: &Watcher, sent: &mut Sent, event:
                 v1::WatchKind::Changed => drop(sent.insert(a.mission_id.clone(), revision)),
                 _ => drop(sent.remove(&a.mission_id)),
             }
-            send(watcher, kind, Some(a.clone())).await
+            send(watcher, kind, Some(mission.shown(&now))).await
         }
         Event::Training(shard) if passes(interest.source, v1::MissionSource::Training) => {
             for assignment in shard.assignments().filter(|a| interest.wants(&a.mission_id)) {

@@ -7,21 +7,20 @@ use magex_proto::weights::Weights;
 use magex_proto::weights_watch::{OPEN_TIMEOUT, WeightsStream, late};
 use magex_runtime::backoff::Backoff;
 use magex_runtime::client::Channel;
+use magex_runtime::peer::{Complaints, Remote};
 use std::sync::Arc;
 use tonic::Status;
 
 /// Follows the learner's weights and reconnects after every failure. Never returns.
-pub(crate) async fn follow(channel: Channel, store: Arc<ModelStore>, load_scheduler: LoadScheduler) {
+pub(crate) async fn follow(learner: Remote, channel: Channel, store: Arc<ModelStore>, load_scheduler: LoadScheduler) {
     let mut backoff = Backoff::default();
-    let mut waiting = false;
+    let mut complaints = Complaints::default();
     loop {
-        let reason = match watch(channel.clone(), &store, load_scheduler, &mut backoff, &mut waiting).await {
-            Ok(()) => "the stream ended".to_owned(),
-            Err(status) => status.message().to_owned(),
-        };
-        if !waiting {
-            tracing::warn!(reason, "no learner; retrying");
-            waiting = true;
+        let ended = watch(channel.clone(), &store, load_scheduler, &mut backoff, &mut complaints).await;
+        let status = ended.err().unwrap_or_else(|| Status::unavailable("the stream ended"));
+        let problem = learner.explain(&status).await;
+        if complaints.due(&problem) {
+            tracing::warn!(reason = problem.text, "no learner; retrying");
         }
         tokio::time::sleep(backoff.next_wait()).await;
     }
@@ -32,12 +31,12 @@ async fn watch(
     store: &ModelStore,
     load_scheduler: LoadScheduler,
     backoff: &mut Backoff,
-    waiting: &mut bool,
+    complaints: &mut Complaints,
 ) -> Result<(), Status> {
     let opening = WeightsStream::open(channel, "commander", SubscriberRole::Commander);
     let mut stream = tokio::time::timeout(OPEN_TIMEOUT, opening).await.map_err(late)??;
     while let Some((weights, toml)) = stream.next().await? {
-        if std::mem::take(waiting) {
+        if complaints.over() {
             tracing::info!("connected to a learner");
         }
         backoff.reset();

@@ -3,6 +3,7 @@
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use magex_assign::pairs;
 use magex_core::ids::ShardKind;
+use magex_dispatch::clock::Now;
 use magex_dispatch::engine::Plan;
 use magex_dispatch::mission::TRAINING_PREFIX;
 use magex_dispatch::{Problem, answer};
@@ -27,8 +28,8 @@ pub(crate) struct TrainingShard {
     pub(crate) key: WeightsKey,
     /// The method of the run's scheduler.
     pub(crate) method: AssignmentMethod,
-    /// When it was answered, milliseconds since 1970.
-    pub(crate) at_ms: i64,
+    /// When it was answered.
+    pub(crate) at: Now,
 }
 
 impl TrainingShard {
@@ -115,9 +116,9 @@ impl TrainingShard {
             version: self.key.version.0,
             sha256: self.key.sha256.clone(),
             run_id,
-            created_ms: self.at_ms,
-            updated_ms: self.at_ms,
-            expires_ms: self.at_ms + LIVE_MS,
+            created_ms: self.at.day_ms,
+            updated_ms: self.at.day_ms,
+            expires_ms: self.at.day_ms + LIVE_MS,
             ..Default::default()
         })
     }
@@ -150,15 +151,15 @@ impl TrainingView {
         }
     }
 
-    /// Shards that are still live at `now` (milliseconds since 1970), oldest first.
-    pub(crate) fn live(&self, now: i64) -> Vec<Arc<TrainingShard>> {
+    /// Shards that are still live, oldest first.
+    pub(crate) fn live(&self, now: &Now) -> Vec<Arc<TrainingShard>> {
         let mut shards = lock(&self.shards);
-        shards.retain(|shard| shard.at_ms + LIVE_MS > now);
+        shards.retain(|shard| shard.at.clock_ms + LIVE_MS > now.clock_ms);
         shards.iter().cloned().collect()
     }
 
     /// The episode of this name.
-    pub(crate) fn get(&self, id: &str, now: i64) -> Option<v1::Assignment> {
+    pub(crate) fn get(&self, id: &str, now: &Now) -> Option<v1::Assignment> {
         self.live(now).iter().find_map(|shard| {
             let b = shard.names().position(|name| name == id)?;
             shard.assignment(b)
@@ -166,7 +167,7 @@ impl TrainingView {
     }
 
     /// Up to `count` episodes after this name, by name.
-    pub(crate) fn page(&self, after: &str, count: usize, now: i64) -> Vec<Episode> {
+    pub(crate) fn page(&self, after: &str, count: usize, now: &Now) -> Vec<Episode> {
         let shards = self.live(now);
         let mut names: Vec<(String, usize, usize)> = shards
             .iter()

@@ -6,6 +6,7 @@ use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::weights::sha256_hex;
 use magex_runtime::exit::Failure;
 use std::fmt::Display;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -30,6 +31,13 @@ fn unusable(path: &Path, problem: impl Display) -> Failure {
     Failure::usage(format!("{}: {problem}", path.display()))
 }
 
+/// Whether a file begins like weights: the length of a JSON object, and that object.
+fn is_safetensors(path: &Path) -> bool {
+    let mut start = [0; 9];
+    let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
+    read.is_ok() && start[8] == b'{'
+}
+
 /// Modification time and size of both files; when it differs they are read.
 type Stamp = [(SystemTime, u64); 2];
 
@@ -48,6 +56,12 @@ impl WeightsFile {
         let config = config.map_or(beside, Path::to_owned);
         if !weights.is_file() {
             return Err(unusable(&weights, "no such file; give the folder of a finished run, or its weights file"));
+        }
+        if !config.is_file() && !is_safetensors(&weights) {
+            return Err(unusable(
+                &weights,
+                "no weights file; give the folder of a finished run, or its weights.safetensors",
+            ));
         }
         if !config.is_file() {
             return Err(unusable(&config, "no such file; give the run's configuration with --config"));

@@ -6,7 +6,8 @@
         magex/v1/types.proto magex/v1/commander.proto
     python3 examples/python/client.py 127.0.0.1:7100
 
-MAGEX_TOKEN holds a bearer token if the service wants one; MAGEX_TLS_CA names the authority of a service with TLS.
+MAGEX_TOKEN holds a bearer token if the service wants one. MAGEX_TLS_CA names the authority of a service with TLS, and
+MAGEX_TLS_CERT and MAGEX_TLS_KEY the client's own certificate and key if it wants one (PEM files).
 """
 
 import os
@@ -27,17 +28,20 @@ from magex.v1 import types_pb2 as types  # noqa: E402
 
 def connect(address):
     """A channel, and the metadata that every call carries."""
-    token = os.environ.get("MAGEX_TOKEN")
+    token = os.environ.get("MAGEX_TOKEN", "").strip()
     metadata = [("authorization", f"Bearer {token}")] if token else []
-    ca = os.environ.get("MAGEX_TLS_CA")
+    ca, certificate, key = (
+        pathlib.Path(path).read_bytes() if (path := os.environ.get(name)) else None
+        for name in ("MAGEX_TLS_CA", "MAGEX_TLS_CERT", "MAGEX_TLS_KEY")
+    )
     if ca is None:
         return grpc.insecure_channel(address), metadata
-    credentials = grpc.ssl_channel_credentials(pathlib.Path(ca).read_bytes())
+    credentials = grpc.ssl_channel_credentials(ca, private_key=key, certificate_chain=certificate)
     return grpc.secure_channel(address, credentials), metadata
 
 
 def positions(points):
-    return pb.Positions(dims=len(points[0]), coordinates=[x for point in points for x in point])
+    return pb.Positions(dims=len(points[0]) if points else 2, coordinates=[x for point in points for x in point])
 
 
 def wrong_fields(error):
@@ -89,6 +93,8 @@ def main():
             yield request
 
     for reply in stub.AssignStream(moving(), metadata=metadata, timeout=10):
+        if reply.WhichOneof("result") is None:
+            continue  # a heartbeat
         print(f"step {reply.sequence}: total {reply.answer.cost:.3f}")
 
     mission = pb.CreateMissionRequest(title="evening charge", switching_cost=2.0)
@@ -108,6 +114,8 @@ def main():
     )
     revisions = []
     for event in changes:
+        if event.kind == pb.WATCH_KIND_HEARTBEAT:
+            continue
         kind = pb.WatchKind.Name(event.kind)
         print(kind, f"revision {event.assignment.revision}" if event.HasField("assignment") else "")
         for change in event.assignment.changes:

@@ -144,7 +144,8 @@ async fn train(
     let limits = Limits::for_task(&config.task, max_shard_episodes(&config) as usize);
     let (handle, mut collector) = learner_service(identity, limits);
     trainer.observe(handle.observer());
-    let handle = handle.guarded(security);
+    let sources = security.sources();
+    let handle = handle.guarded(security).beating(args.security.heartbeat());
     let showing = context.has_page().then(|| Arc::new(LivePage::new(&config, live)));
     let routes = match &showing {
         Some(live) => {
@@ -154,9 +155,11 @@ async fn train(
         }
         None => handle.routes(),
     };
-    let page = context.announce(routes);
+    context.reload(sources, handle.metrics());
+    let page = context.serve_page(routes);
     let (served, until) = (handle.clone(), stop.clone());
     let serving = tokio::spawn(async move { served.serve(incoming, until).await });
+    context.announce();
     let (ended, training_end) = tokio::sync::oneshot::channel();
     std::thread::Builder::new()
         .name("magex-train".to_owned())

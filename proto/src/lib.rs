@@ -23,6 +23,16 @@ pub fn encoded_len(message: &impl prost::Message) -> usize {
     message.encoded_len()
 }
 
+/// The services of this program on the wire, and their names for people.
+pub const SERVICES: [(&str, &str); 2] =
+    [(v1::learner_service_server::SERVICE_NAME, LEARNER), (v1::commander_service_server::SERVICE_NAME, COMMANDER)];
+
+/// The learner's name for people.
+pub const LEARNER: &str = "learner";
+
+/// The commander's name for people.
+pub const COMMANDER: &str = "commander";
+
 /// Version of the protocol that this build speaks; both sides of a handshake must agree on it.
 pub const PROTOCOL_VERSION: u32 = 2;
 

@@ -46,6 +46,10 @@ impl WeightsStream {
     /// After an error, subscribe again.
     pub async fn next(&mut self) -> Result<Option<(Weights, String)>, Status> {
         while let Some(message) = self.stream.message().await? {
+            if message.part.is_none() && message.sha256.is_empty() {
+                // A heartbeat.
+                continue;
+            }
             let pushed = self.assembler.push(message);
             if let Some(weights) = pushed.map_err(|error| Status::data_loss(format!("damaged weights: {error}")))? {
                 return Ok(Some(weights));

@@ -53,9 +53,15 @@ pub struct Process {
 impl Process {
     /// Starts the program with these arguments; what it writes to standard error is added to `log`.
     pub fn start(arguments: &[&str], log: &Path) -> Self {
+        Self::start_in(arguments, &[], log)
+    }
+
+    /// The same with these variables in its environment.
+    pub fn start_in(arguments: &[&str], environment: &[(String, PathBuf)], log: &Path) -> Self {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log).expect("a log file");
         let child = Command::new(binary())
             .args(arguments)
+            .envs(environment.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(file)
@@ -70,11 +76,20 @@ impl Process {
         ready["address"].as_str().unwrap_or_else(|| panic!("no address in '{ready}'")).to_owned()
     }
 
-    fn ready_line(&mut self) -> serde_json::Value {
+    /// The whole of that line.
+    pub fn ready_line(&mut self) -> serde_json::Value {
         let mut line = String::new();
         let out = self.child.stdout.take().expect("standard output is piped");
         BufReader::new(out).read_line(&mut line).expect("standard output can be read");
         serde_json::from_str(&line).unwrap_or_else(|e| panic!("ready line '{line}': {e}\n{}", self.log()))
+    }
+
+    /// Everything that it has written to standard output; for a process that has ended.
+    pub fn output(&mut self) -> String {
+        let mut text = String::new();
+        let mut out = self.child.stdout.take().expect("standard output is piped");
+        std::io::Read::read_to_string(&mut out, &mut text).expect("standard output can be read");
+        text
     }
 
     /// What it has written to standard error.
@@ -156,8 +171,9 @@ pub struct Cluster {
     pub actors: Vec<Process>,
     /// Where services show their metrics, by name of the service; only of those that were asked to.
     pub pages: Vec<(String, String)>,
-    /// Options that all services get.
+    /// Options that all services get, and variables of their environments.
     extra: Vec<String>,
+    environment: Vec<(String, PathBuf)>,
     learner_address: String,
     commander_address: String,
     started: usize,
@@ -195,11 +211,13 @@ pub struct Setup {
     pub wires: Option<u64>,
     /// Options that the learner, the commander and the actors get, too.
     pub options: Vec<String>,
+    /// Variables in the environment of all of them.
+    pub environment: Vec<(String, PathBuf)>,
 }
 
 impl Default for Setup {
     fn default() -> Self {
-        Self { lease: 2.0, run: None, wires: None, options: Vec::new() }
+        Self { lease: 2.0, run: None, wires: None, options: Vec::new(), environment: Vec::new() }
     }
 }
 
@@ -225,7 +243,7 @@ impl Cluster {
         let mut arguments = vec!["learner", "--config", &given, "--out", &out, "--listen", "127.0.0.1:0"];
         arguments.extend(["--threads", "1", "--lease-seconds", &lease]);
         arguments.extend(setup.options.iter().map(String::as_str));
-        let mut learner = Process::start(&arguments, &folder.path().join("learner.log"));
+        let mut learner = Process::start_in(&arguments, &setup.environment, &folder.path().join("learner.log"));
         let ready = learner.ready_line();
         let learner_address = ready["address"].as_str().expect("the learner's address").to_owned();
         // The commander's address must be known before it starts.
@@ -245,6 +263,7 @@ impl Cluster {
             actors: Vec::new(),
             pages: Vec::new(),
             extra: setup.options,
+            environment: setup.environment,
             learner_address,
             commander_address,
             started: 0,
@@ -270,7 +289,7 @@ impl Cluster {
         let learner = format!("http://{learner}");
         let mut arguments = vec!["commander", "--learner", &learner, "--listen", &self.commander_address];
         arguments.extend(self.extra.iter().map(String::as_str));
-        let mut commander = Process::start(&arguments, &self.folder.path().join("commander.log"));
+        let mut commander = Process::start_in(&arguments, &self.environment, &self.folder.path().join("commander.log"));
         let ready = commander.ready_line();
         self.commander_address = ready["address"].as_str().expect("the commander's address").to_owned();
         self.commander = Some(commander);
@@ -300,10 +319,12 @@ impl Cluster {
             vec!["actor", "--learner", &learner, "--commander", &commander, "--threads", "1", "--name", &name];
         arguments.extend(extra);
         arguments.extend(self.extra.iter().map(String::as_str));
-        let mut actor = Process::start(&arguments, &self.folder.path().join(format!("{name}.log")));
-        let ready = actor.ready_line();
+        let mut actor =
+            Process::start_in(&arguments, &self.environment, &self.folder.path().join(format!("{name}.log")));
+        // An actor is ready when a learner has accepted it, which may be never; only its page is of interest here.
+        let ready = self.extra.iter().any(|option| option == "--http").then(|| actor.ready_line());
         self.actors.push(actor);
-        self.note_page("actor", &ready);
+        ready.iter().for_each(|ready| self.note_page("actor", ready));
     }
 
     /// Starts the learner again from its checkpoint, on its old address.

@@ -103,6 +103,7 @@ fn bottlenecks(config: &RunConfig, delay: Duration, bytes_per_second: Option<f64
             expected_task: None,
             client: Default::default(),
             stay: false,
+            accepted: tokio_util::sync::CancellationToken::new(),
         };
         tokio::spawn(magex_actor::run::run(actor, late(delay), Arc::default(), stop.clone()));
     });

@@ -3,6 +3,7 @@
 //! After a failed write the database rejects all further writes, and it is unknown whether the failed write is in the file. So
 //! before the next write the file is reopened and made equal to the missions in memory, which are the acknowledged ones.
 
+use crate::clock::Mark;
 use crate::mission::Mission;
 use redb::{Database, ReadableDatabase as _, ReadableTable as _, TableDefinition, TableError};
 use std::collections::{BTreeMap, HashSet};
@@ -15,6 +16,8 @@ use std::time::{Duration, Instant};
 const MISSIONS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("missions");
 /// Properties of the file.
 const ABOUT: TableDefinition<'_, &str, u64> = TableDefinition::new("about");
+/// Names of the parts of a [`Mark`] there, in its order.
+const MARK: [&str; 4] = ["clock_ms", "boot_ms", "boot", "day_ms"];
 /// Format of the records; a file with another one is rejected.
 const FORMAT: u64 = 2;
 /// Page cache, bytes: small, because the missions themselves are in memory.
@@ -73,6 +76,8 @@ pub struct Disk {
     /// Time of the last failed write.
     failed: Option<Instant>,
     pause: Duration,
+    /// The clock at the next change.
+    mark: Mark,
 }
 
 impl fmt::Debug for Disk {
@@ -93,7 +98,7 @@ impl Disk {
     pub fn opened_by(opener: Opener, pause: Duration) -> Result<Self, DiskError> {
         let database = opener()?;
         prepare(&database)?;
-        Ok(Self { opener, database: Some(database), failed: None, pause })
+        Ok(Self { opener, database: Some(database), failed: None, pause, mark: Mark::default() })
     }
 
     /// All missions, by name. Fails if a record is damaged.
@@ -109,6 +114,24 @@ impl Disk {
         Ok(missions)
     }
 
+    /// The clock at the last change; `None` in a file of a version that did not write it down.
+    pub fn mark(&self) -> Result<Option<Mark>, DiskError> {
+        let read = self.database.as_ref().ok_or(DiskError::Paused)?.begin_read()?;
+        let about = read.open_table(ABOUT)?;
+        let mut values = [0; MARK.len()];
+        for (name, value) in MARK.iter().zip(&mut values) {
+            let Some(found) = about.get(*name)? else { return Ok(None) };
+            *value = found.value();
+        }
+        let [clock, boot_ms, boot, day] = values;
+        Ok(Some(Mark { clock_ms: clock as i64, boot_ms: boot_ms as i64, boot, day_ms: day as i64 }))
+    }
+
+    /// The clock that the next change writes down.
+    pub fn set_mark(&mut self, mark: Mark) {
+        self.mark = mark;
+    }
+
     /// Writes and removes missions in one durable transaction. `kept` are all acknowledged missions.
     /// After a failed write nothing has changed for clients, and the file is reopened before the next change.
     pub fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), DiskError> {
@@ -118,7 +141,8 @@ impl Disk {
             None if self.failed.is_some_and(|since| since.elapsed() < self.pause) => return Err(DiskError::Paused),
             None => self.reopen(kept),
         };
-        let written = database.and_then(|database| write(&database, put, remove).map(|()| database));
+        let mark = &self.mark;
+        let written = database.and_then(|database| write(&database, put, remove, mark).map(|()| database));
         match written {
             Ok(database) => self.database = Some(database),
             Err(error) => {
@@ -132,12 +156,12 @@ impl Disk {
     fn reopen(&self, kept: &Kept) -> Result<Database, DiskError> {
         let database = (self.opener)()?;
         prepare(&database)?;
-        mirror(&database, kept)?;
+        mirror(&database, kept, &self.mark)?;
         Ok(database)
     }
 }
 
-fn write(database: &Database, put: &[&Mission], remove: &[&str]) -> Result<(), DiskError> {
+fn write(database: &Database, put: &[&Mission], remove: &[&str], mark: &Mark) -> Result<(), DiskError> {
     let write = database.begin_write()?;
     {
         let mut table = write.open_table(MISSIONS)?;
@@ -146,6 +170,11 @@ fn write(database: &Database, put: &[&Mission], remove: &[&str]) -> Result<(), D
         }
         for id in remove {
             table.remove(*id)?;
+        }
+        let mut about = write.open_table(ABOUT)?;
+        let Mark { clock_ms, boot_ms, boot, day_ms } = *mark;
+        for (name, value) in MARK.into_iter().zip([clock_ms as u64, boot_ms as u64, boot, day_ms as u64]) {
+            about.insert(name, value)?;
         }
     }
     write.commit()?;
@@ -173,7 +202,7 @@ fn prepare(database: &Database) -> Result<(), DiskError> {
 }
 
 /// Makes the file equal to `kept`: removes a change that failed but was written, and restores acknowledged missions.
-fn mirror(database: &Database, kept: &Kept) -> Result<(), DiskError> {
+fn mirror(database: &Database, kept: &Kept, mark: &Mark) -> Result<(), DiskError> {
     let (mut same, mut unknown) = (HashSet::new(), Vec::new());
     {
         let read = database.begin_read()?;
@@ -191,5 +220,5 @@ fn mirror(database: &Database, kept: &Kept) -> Result<(), DiskError> {
     if put.is_empty() && unknown.is_empty() {
         return Ok(());
     }
-    write(database, &put, &unknown.iter().map(String::as_str).collect::<Vec<_>>())
+    write(database, &put, &unknown.iter().map(String::as_str).collect::<Vec<_>>(), mark)
 }

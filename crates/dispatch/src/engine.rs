@@ -70,6 +70,9 @@ pub fn solve(
     kind: AssignmentMethod,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Plan, AssignError> {
+    if problem.cells() == 0 {
+        return Ok(nothing(problem, kind));
+    }
     with_workspace(problem, |workspace| {
         let (rows, cols) = (problem.agent_count, problem.goal_count);
         problem.costs_into(&mut workspace.costs)?;
@@ -94,6 +97,13 @@ pub fn solve(
         };
         workspace.finish(problem, Plan { goal_of, scheduler, exact_cost, ..Plan::default() }, should_continue)
     })
+}
+
+/// The plan of a team without agents or without goals: all others are left over, at no cost, whatever the method.
+fn nothing(problem: &Problem, kind: AssignmentMethod) -> Plan {
+    let scheduler = if kind == AssignmentMethod::Learned { AssignmentMethod::Exact } else { kind };
+    let (goal_of, pair_costs) = (vec![UNASSIGNED; problem.agent_count], vec![0.0; problem.agent_count]);
+    Plan { goal_of, scheduler, exact_cost: Some(0.0), pair_costs, ..Plan::default() }
 }
 
 /// Makes a plan of the answer of the learned method. An error is the reason of a fallback.
@@ -121,6 +131,9 @@ pub fn adopt(
 pub fn not_for_learned(problem: &Problem) -> Option<&'static str> {
     if problem.matrix.is_some() || !problem.overrides.is_empty() {
         return Some("the learned scheduler supports positions only, not costs");
+    }
+    if problem.cells() == 0 {
+        return Some("without agents or without goals there is nothing to choose");
     }
     (learned_cells(problem) > GAP_CELLS)
         .then_some("the learned scheduler supports at most 1,000 agents and 1,000 goals")

@@ -2,12 +2,13 @@
 //!
 //! A request is parsed and checked ([`problem`]), solved ([`engine`]), and answered ([`answer`]). A mission ([`mission`]) is a
 //! persistent team: it is re-planned on every change, with a switching cost that favours current assignments. [`missions`] stores
-//! missions, bounded in number and age, in a file ([`disk`]). Missions are wire types on purpose: a mission's assignment is the
+//! missions, bounded in number and age ([`clock`]), in a file ([`disk`]). Missions are wire types on purpose: a mission's assignment is the
 //! message that clients receive and the record that is stored.
 //!
 //! For every input the answer is a valid matching or an error that names the field.
 
 pub mod answer;
+pub mod clock;
 pub mod disk;
 pub mod engine;
 pub mod mission;

@@ -5,6 +5,7 @@ mod changes;
 mod members;
 
 use crate::answer::Planned;
+use crate::clock::Now;
 use crate::problem::{Problem, pairs, priced_pairs, switching_cost};
 use crate::{AssignError, UNASSIGNED};
 use changes::sentence;
@@ -47,6 +48,8 @@ pub struct Mission {
     forbidden: BTreeSet<Names>,
     overrides: BTreeMap<Names, f64>,
     lifetime_ms: i64,
+    /// When it expires, on the clock of missions.
+    deadline_ms: i64,
 }
 
 /// The record on disk.
@@ -60,6 +63,8 @@ struct Record {
     overrides: Vec<v1::PairCost>,
     #[prost(int64, tag = "4")]
     lifetime_ms: i64,
+    #[prost(int64, optional, tag = "5")]
+    deadline_ms: Option<i64>,
 }
 
 impl Mission {
@@ -75,16 +80,17 @@ impl Mission {
         (self.assignment.agents.len(), self.assignment.goals.len())
     }
 
-    /// Creates and plans a mission. `drawn_id` is its name if the request has none; `now` is milliseconds since 1970.
+    /// Creates and plans a mission. `drawn_id` is its name if the request has none.
     /// An error names the first invalid field, or is the planner's.
     pub fn create(
         request: v1::CreateMissionRequest,
         owner: &str,
         drawn_id: &str,
-        now: i64,
+        now: impl Into<Now>,
         limits: &MissionLimits,
         planner: &Planner<'_>,
     ) -> Result<Self, AssignError> {
+        let now = now.into();
         let id = if request.mission_id.is_empty() { drawn_id.to_owned() } else { request.mission_id };
         check_id(&id)?;
         ConvertError::ensure(request.title.len() <= LONGEST_TITLE, || {
@@ -99,12 +105,13 @@ impl Mission {
                 owner: owner.to_owned(),
                 scheduler: v1::AssignmentMethod::from(kind).into(),
                 switching_cost: switching_cost(request.switching_cost)?,
-                created_ms: now,
+                created_ms: now.day_ms,
                 ..Default::default()
             },
             forbidden: BTreeSet::new(),
             overrides: BTreeMap::new(),
             lifetime_ms: lifetime(request.lifetime_seconds, limits)?,
+            deadline_ms: 0,
         };
         let content = v1::UpdateMissionRequest {
             agents: request.agents,
@@ -120,11 +127,11 @@ impl Mission {
     pub fn update(
         &self,
         request: v1::UpdateMissionRequest,
-        now: i64,
+        now: impl Into<Now>,
         limits: &MissionLimits,
         planner: &Planner<'_>,
     ) -> Result<Self, AssignError> {
-        self.clone().change("forbid", request, now, limits, planner)
+        self.clone().change("forbid", request, now.into(), limits, planner)
     }
 
     /// Applies a request, in which `forbid` is the name of the list of pairs to forbid, and plans.
@@ -132,7 +139,7 @@ impl Mission {
         mut self,
         forbid: &str,
         request: v1::UpdateMissionRequest,
-        now: i64,
+        now: Now,
         limits: &MissionLimits,
         planner: &Planner<'_>,
     ) -> Result<Self, AssignError> {
@@ -178,6 +185,16 @@ impl Mission {
         &self.assignment.mission_id
     }
 
+    /// Whether it has expired.
+    pub fn expired(&self, now: &Now) -> bool {
+        self.deadline_ms <= now.clock_ms
+    }
+
+    /// What a client sees now: the time of day at which it will expire follows a clock that was set.
+    pub fn shown(&self, now: &Now) -> v1::Assignment {
+        v1::Assignment { expires_ms: now.day_of(self.deadline_ms), ..self.assignment.clone() }
+    }
+
     /// Encodes the record on disk.
     pub fn encode(&self) -> Vec<u8> {
         let pair = |(agent, goal): &Names| v1::PairRef {
@@ -191,6 +208,7 @@ impl Mission {
             forbidden: self.forbidden.iter().map(pair).collect(),
             overrides: self.overrides.iter().map(priced).collect(),
             lifetime_ms: self.lifetime_ms,
+            deadline_ms: Some(self.deadline_ms),
         };
         prost::Message::encode_to_vec(&record)
     }
@@ -202,12 +220,15 @@ impl Mission {
         let names = |pair: v1::PairRef| (pair.agent_id, pair.goal_id);
         let assignment = record.assignment.ok_or_else(|| ConvertError::missing("mission"))?;
         check_record(&assignment, &record.overrides)?;
+        // A record of a version whose lifetimes ran on the time of day.
+        let deadline_ms = record.deadline_ms.unwrap_or(assignment.expires_ms);
         let overrides = record.overrides.into_iter();
         Ok(Self {
             assignment,
             forbidden: record.forbidden.into_iter().map(names).collect(),
             overrides: overrides.filter_map(|item| Some((names(item.pair?), item.cost))).collect(),
             lifetime_ms: record.lifetime_ms,
+            deadline_ms,
         })
     }
 
@@ -286,7 +307,7 @@ impl Mission {
         Some((problem, agents, goals))
     }
 
-    fn plan(&mut self, removed: &Removed, now: i64, planner: &Planner<'_>) -> Result<(), AssignError> {
+    fn plan(&mut self, removed: &Removed, now: Now, planner: &Planner<'_>) -> Result<(), AssignError> {
         let before = self.assignment.pairs.clone();
         let solved = match self.problem() {
             Some((problem, agents, goals)) => Some((planner(&problem)?.respond(&problem), agents, goals)),
@@ -294,8 +315,10 @@ impl Mission {
         };
         let a = &mut self.assignment;
         a.revision += 1;
-        a.updated_ms = now;
-        a.expires_ms = now.saturating_add(self.lifetime_ms);
+        // The order of revisions is seen in their times, whatever the time of day does.
+        a.updated_ms = now.day_ms.max(a.updated_ms).max(a.created_ms);
+        self.deadline_ms = now.clock_ms.saturating_add(self.lifetime_ms);
+        a.expires_ms = now.day_of(self.deadline_ms);
         let mut reasons = None;
         let response = match solved {
             Some((mut response, agents, goals)) => {

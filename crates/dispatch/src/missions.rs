@@ -3,6 +3,7 @@
 //! An update replaces revision r by r + 1 under one lock: it checks that r is still current, writes r + 1 to disk, and shows it
 //! to readers. If r has changed, the caller plans again.
 
+use crate::clock::{Clock, Mark, Now};
 use crate::disk::{Disk, DiskError, Kept};
 use crate::mission::{Mission, MissionLimits};
 use magex_proto::v1;
@@ -73,10 +74,13 @@ struct WriteState {
 
 impl WriteState {
     /// Writes a change to the file.
-    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), KeepError> {
+    fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept, clock: &Clock) -> Result<(), KeepError> {
         match &mut self.disk {
             _ if self.closed => Err(KeepError::Closed),
-            Some(disk) => Ok(disk.change(put, remove, kept)?),
+            Some(disk) => {
+                disk.set_mark(clock.mark());
+                Ok(disk.change(put, remove, kept)?)
+            }
             None => Ok(()),
         }
     }
@@ -110,16 +114,22 @@ pub struct Missions {
     writing: Mutex<WriteState>,
     /// The limits.
     pub bounds: Bounds,
+    /// The clock of their lifetimes.
+    pub clock: Clock,
 }
 
 impl Missions {
     /// Loads the missions of a file; without a file they are lost when the process ends.
     pub fn open(disk: Option<Disk>, bounds: Bounds) -> Result<Self, DiskError> {
         let loaded = disk.as_ref().map(Disk::load).transpose()?.unwrap_or_default();
+        let mark = disk.as_ref().map(Disk::mark).transpose()?.flatten();
+        // Without a mark the clock was the time of day, and the last that is known of it are the missions themselves.
+        let last = loaded.iter().map(|mission| mission.assignment.updated_ms).max();
+        let clock = Clock::resume(mark.or_else(|| Some(Mark { clock_ms: last?, ..Mark::default() })));
         let mut writing = WriteState { disk, ..WriteState::default() };
         loaded.iter().for_each(|mission| writing.resize(mission, Some(mission.bytes())));
         let kept = loaded.into_iter().map(|mission| (mission.id().to_owned(), Arc::new(mission))).collect();
-        Ok(Self { kept: RwLock::new(kept), writing: Mutex::new(writing), bounds })
+        Ok(Self { kept: RwLock::new(kept), writing: Mutex::new(writing), bounds, clock })
     }
 
     /// Number of missions.
@@ -193,22 +203,21 @@ impl Missions {
         let mut writing = self.lock();
         let found = self.get(id).filter(|mission| may(mission));
         let mission = found.ok_or_else(|| KeepError::Missing(id.to_owned()))?;
-        writing.change(&[], &[id], &self.read())?;
+        writing.change(&[], &[id], &self.read(), &self.clock)?;
         writing.resize(&mission, None);
         self.write().remove(id);
         Ok(mission)
     }
 
-    /// Deletes the missions that have expired at `now` (milliseconds since 1970), and returns them.
-    pub fn expire(&self, now: i64) -> Result<Vec<Arc<Mission>>, KeepError> {
-        let mut writing = self.lock();
-        let old: Vec<Arc<Mission>> =
-            self.read().values().filter(|mission| mission.assignment.expires_ms <= now).cloned().collect();
+    /// Deletes the missions that have expired, and returns them.
+    pub fn expire(&self, now: impl Into<Now>) -> Result<Vec<Arc<Mission>>, KeepError> {
+        let (mut writing, now) = (self.lock(), now.into());
+        let old: Vec<Arc<Mission>> = self.read().values().filter(|mission| mission.expired(&now)).cloned().collect();
         if old.is_empty() {
             return Ok(old);
         }
         let ids: Vec<&str> = old.iter().map(|mission| mission.id()).collect();
-        writing.change(&[], &ids, &self.read())?;
+        writing.change(&[], &ids, &self.read(), &self.clock)?;
         old.iter().for_each(|mission| writing.resize(mission, None));
         let mut kept = self.write();
         ids.iter().for_each(|id| drop(kept.remove(*id)));
@@ -216,8 +225,16 @@ impl Missions {
         Ok(old)
     }
 
+    /// Writes the clock down, so that after a crash and another boot little is counted twice.
+    pub fn note_time(&self) -> Result<(), KeepError> {
+        let (mut writing, kept) = (self.lock(), self.read());
+        if kept.is_empty() { Ok(()) } else { writing.change(&[], &[], &kept, &self.clock) }
+    }
+
     /// Closes the file; further changes fail.
     pub fn close(&self) {
+        // If it cannot be written, missions live a little longer after another boot.
+        let _ = self.note_time();
         let mut writing = self.lock();
         (writing.disk, writing.closed) = (None, true);
     }
@@ -240,7 +257,7 @@ impl Missions {
                 }
             }
         }
-        writing.change(&[&mission], &[], &self.read())?;
+        writing.change(&[&mission], &[], &self.read(), &self.clock)?;
         writing.resize(&mission, Some(size));
         let mission = Arc::new(mission);
         self.write().insert(mission.id().to_owned(), mission.clone());

@@ -97,11 +97,14 @@ impl Problem {
             (None, None) if message.costs.is_some() => None,
             (agents, goals) => Some((points("agents", agents, limits)?, points("goals", goals, limits)?)),
         };
-        let ((agents, dims), (goals, goal_dims)) = positions.unwrap_or_default();
-        ConvertError::ensure(dims == goal_dims, || {
+        let has_positions = positions.is_some();
+        let ((agents, agent_dims), (goals, goal_dims)) = positions.unwrap_or_default();
+        // The dimensions of no points mean nothing.
+        let dims = if agents.is_empty() { goal_dims } else { agent_dims };
+        ConvertError::ensure(dims == goal_dims || goals.is_empty(), || {
             ("goals", format!("{goal_dims} dimensions, the agents have {dims}"))
         })?;
-        let counts = (dims > 0).then(|| (agents.len() / dims, goals.len() / dims));
+        let counts = has_positions.then(|| (agents.len() / dims.max(1), goals.len() / dims.max(1)));
         let (matrix, (agent_count, goal_count)) = match (message.costs, counts) {
             (Some(costs), counts) => {
                 let shape = check_matrix(&costs, counts, limits)?;
@@ -207,12 +210,14 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
         }
         None => (positions.coordinates, positions.dims as usize),
     };
-    ConvertError::ensure((2..=3).contains(&dims), || (format!("{field}.dims"), format!("{dims} is not 2 or 3")))?;
-    ConvertError::ensure(!values.is_empty() && values.len().is_multiple_of(dims), || {
+    // An empty side is a normal request: there may be nothing to do, or no agent left.
+    let known = (2..=3).contains(&dims) || (dims == 0 && values.is_empty());
+    ConvertError::ensure(known, || (format!("{field}.dims"), format!("{dims} is not 2 or 3")))?;
+    ConvertError::ensure(values.is_empty() || values.len().is_multiple_of(dims), || {
         let problem = format!("{} numbers do not make points of {dims} coordinates", values.len());
         (format!("{field}.coordinates"), problem)
     })?;
-    let count = values.len() / dims;
+    let count = values.len() / dims.max(1);
     ConvertError::ensure(count <= limits.members, || {
         (field, format!("{count} points exceed the limit of {}", limits.members))
     })?;
@@ -228,8 +233,8 @@ fn check_matrix(
     let (agents, goals) = (costs.agents as usize, costs.goals as usize);
     let (agent_points, goal_points) = counts.unzip();
     for (field, found, points) in [("costs.agents", agents, agent_points), ("costs.goals", goals, goal_points)] {
-        ConvertError::ensure((1..=limits.members).contains(&found), || {
-            (field, format!("{found} is not in 1..{}", limits.members))
+        ConvertError::ensure(found <= limits.members, || {
+            (field, format!("{found} exceed the limit of {}", limits.members))
         })?;
         if let Some(points) = points.filter(|&points| points != found) {
             return Err(ConvertError::new(field, format!("{found}, but there are {points} positions")));

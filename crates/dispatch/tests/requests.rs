@@ -93,6 +93,50 @@ fn unassigned_agents_have_a_reason() {
 }
 
 #[test]
+fn a_team_without_agents_or_without_goals_is_answered_and_the_others_are_left_over() {
+    let (two, none) = ([0.0, 0.0, 1.0, 0.0], [0.0; 0]);
+    let packed = |rows: usize, dims: usize| {
+        let values = vec![0.5; rows * dims];
+        Some(v1::Positions { array: Some(arrays::from_f32(&[rows, dims], &values)), ..Default::default() })
+    };
+    let costs = |agents, goals| v1::AssignRequest {
+        costs: Some(v1::CostMatrix { agents, goals, values: vec![] }),
+        ..Default::default()
+    };
+    let named = v1::AssignRequest { agent_ids: vec!["a".into(), "b".into()], ..team(&two, &none) };
+    let forms = [
+        (team(&two, &none), 2, 0),
+        (team(&none, &two), 0, 2),
+        (team(&none, &none), 0, 0),
+        // The dimensions of no points do not count.
+        (v1::AssignRequest { goals: positions(0, &[]), ..team(&two, &none) }, 2, 0),
+        (v1::AssignRequest { agents: positions(0, &[]), goals: positions(0, &[]), ..Default::default() }, 0, 0),
+        (v1::AssignRequest { agents: positions(3, &[]), ..team(&none, &two) }, 0, 2),
+        (v1::AssignRequest { agents: packed(3, 2), goals: packed(0, 2), ..Default::default() }, 3, 0),
+        (v1::AssignRequest { agents: packed(0, 0), goals: packed(1, 3), ..Default::default() }, 0, 1),
+        (costs(2, 0), 2, 0),
+        (costs(0, 3), 0, 3),
+        (costs(0, 0), 0, 0),
+        (v1::AssignRequest { agents: positions(2, &two), goals: positions(2, &none), ..costs(2, 0) }, 2, 0),
+        (named, 2, 0),
+    ];
+    for (message, agents, goals) in forms {
+        let problem = read(message.clone());
+        for kind in [&KINDS[..], &[AssignmentMethod::Learned]].concat() {
+            let response = answer::write(&problem, &solve(&problem, kind));
+            assert!(response.pairs.is_empty() && response.gap == Some(0.0), "{message:?}");
+            assert_eq!((response.cost, response.exact_cost, response.largest_cost), (0.0, Some(0.0), 0.0));
+            let left = [response.unassigned_agents.len(), response.unassigned_goals.len()];
+            assert_eq!(left, [agents, goals], "{message:?}");
+            let idle = response.agents_without_goal.iter().chain(&response.goals_without_agent);
+            assert!(idle.clone().all(|member| member.reason() == v1::UnassignedReason::Outnumbered));
+            assert_eq!(idle.count(), agents + goals);
+        }
+        assert!(engine::not_for_learned(&problem).is_some(), "a model is not asked");
+    }
+}
+
+#[test]
 fn makespan_minimises_the_longest_way() {
     // The cheapest sum sends one agent far: 0 + 10; the shortest longest way is 6 + 6.
     let costs = v1::CostMatrix { agents: 2, goals: 2, values: vec![0.0, 6.0, 6.0, 10.0] };
@@ -112,7 +156,8 @@ fn wrong_fields_are_named() {
     };
     check(|m| m.agents = None, "agents: missing");
     check(|m| (m.agents, m.goals) = (None, None), "agents: missing");
-    check(|m| m.goals = positions(2, &[]), "goals.coordinates: 0 numbers");
+    check(|m| m.goals = None, "goals: missing");
+    check(|m| m.goals = positions(0, &[1.0]), "goals.dims: 0");
     check(|m| m.goals = positions(2, &[1.0]), "goals.coordinates: 1 numbers");
     check(|m| m.goals = positions(4, &[1.0; 4]), "goals.dims: 4");
     check(|m| m.goals = positions(3, &[1.0; 3]), "goals: 3 dimensions, the agents have 2");
@@ -146,7 +191,7 @@ fn wrong_fields_are_named() {
         assert!(error.starts_with(words), "{error} instead of {words}");
     };
     check(matrix(2, 1, &[1.0, 1.0]), "costs.agents: 2, but there are 1");
-    check(matrix(0, 1, &[]), "costs.agents: 0");
+    check(matrix(0, 1, &[]), "costs.agents: 0, but there are 1");
     check(matrix(1, u32::MAX, &[]), "costs.goals: 4294967295");
     check(matrix(1, 1, &[]), "costs.values: 0 numbers");
     check(matrix(1, 1, &[1e101]), "costs.values[0]: 1");

@@ -110,7 +110,7 @@ pub(crate) async fn run(
         let (name, threads) = (format!("actor-{index}"), plan.actors.threads.to_string());
         let arguments =
             ["actor", "--name", &name, "--learner", &url, "--commander", &commander_url, "--threads", &threads];
-        let actor = Service::new(&name, &arguments, logs);
+        let actor = Service::new(&name, &arguments, logs).unawaited();
         let first = actor.start().await?;
         services.spawn(keep(actor, first, stop.clone()));
     }

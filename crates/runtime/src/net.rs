@@ -15,7 +15,7 @@
 //!     │   Public:  (health, reflection) the caller is its address; the connection is `Probed`
 //!     │   both:    take a `Permit`: calls or streams of the caller      [in_flight]
 //!     │            `grpc-timeout` becomes a `Deadline`                  [deadline]
-//!     │   body:    the length of every message is counted before the message is read
+//!     │   body:    the length of every message is counted before the message is read; compressed ones are unpacked [compression]
 //!     ▼
 //!  decoding, then the handler: `auth::caller` checks the role
 //!     │
@@ -28,7 +28,10 @@
 
 pub mod auth;
 pub mod call_metrics;
+mod compression;
 pub mod connections;
 pub mod deadline;
 pub mod guard;
+pub mod heartbeat;
 pub mod in_flight;
+pub mod socket;

@@ -2,13 +2,15 @@
 
 use crate::client::{Settings, Token};
 use crate::exit::Failure;
-use crate::net::auth::Access;
+use crate::net::auth::{Access, NEEDS_CLIENT_CA};
 use crate::net::connections::ConnectionLimits;
+use crate::reload::Source;
 use crate::server;
 use crate::tls::{ClientTls, ServerTls};
 use clap::Args;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// The security of a service's port.
 #[derive(Debug, Clone, Default)]
@@ -17,6 +19,25 @@ pub struct Security {
     pub tls: Option<ServerTls>,
     /// The identities that may call.
     pub access: Access,
+}
+
+impl Security {
+    /// Every client must present a certificate.
+    fn mutual(&self) -> bool {
+        self.tls.as_ref().is_some_and(ServerTls::mutual)
+    }
+
+    /// What can be read again while the service runs.
+    pub fn sources(&self) -> Vec<Source> {
+        let (mutual, access) = (self.mutual(), self.access.clone());
+        let tls = self.tls.clone().map(|tls| {
+            let (files, again, ends) = (tls.files(), tls.clone(), tls);
+            Source::new("the service's certificate", files, move || again.reload()).ending(move || ends.ends())
+        });
+        let identities = self.access.path().map(|path| vec![path.to_owned()]);
+        let identities = identities.map(|files| Source::new("the identities", files, move || access.reload(mutual)));
+        tls.into_iter().chain(identities).collect()
+    }
 }
 
 /// Options of a service that listens.
@@ -43,6 +64,9 @@ pub struct ServerArgs {
     /// Maximum number of connections from one IP address
     #[arg(long, default_value_t = 1024, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
     pub connections_per_peer: u32,
+    /// Seconds between heartbeats on server streams, so that balancers keep quiet ones open; 0 for none
+    #[arg(long, env = "MAGEX_HEARTBEAT", default_value_t = 30, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(..=3600), help_heading = "Limits")]
+    pub heartbeat: u32,
 }
 
 impl ServerArgs {
@@ -52,18 +76,20 @@ impl ServerArgs {
         ConnectionLimits { total, per_peer, ..ConnectionLimits::default() }
     }
 
+    /// Time between heartbeats on server streams, if there are any.
+    pub fn heartbeat(&self) -> Option<Duration> {
+        (self.heartbeat > 0).then(|| Duration::from_secs(self.heartbeat.into()))
+    }
+
     /// Reads the files of the options. A non-loopback address needs TLS and authentication, unless `--insecure` is given.
     pub fn read(&self, listen: &str) -> Result<Security, Failure> {
         let access = self.identities.as_deref().map(Access::read).transpose()?;
         let read = |(certificate, key)| ServerTls::read(certificate, key, self.client_ca.as_deref());
         let tls = self.own().map(read).transpose()?;
-        server::secure_builder(tls.as_ref()).map_err(|error| Failure::usage(format!("--tls-cert: {error}")))?;
         let security = Security { tls, access: access.unwrap_or_default() };
-        if security.access.certificates && !security.tls.as_ref().is_some_and(|tls| tls.mutual) {
+        if security.access.certificates() && !security.mutual() {
             // Without it no client certificate is requested, so those identities could not authenticate.
-            return Err(Failure::usage(
-                "--identities: certificate_sha256 needs --client-ca, so that callers present their certificates",
-            ));
+            return Err(Failure::usage(NEEDS_CLIENT_CA));
         }
         self.check_exposure(listen, &security)?;
         Ok(security)
@@ -71,7 +97,7 @@ impl ServerArgs {
 
     fn check_exposure(&self, listen: &str, security: &Security) -> Result<(), Failure> {
         let address = server::resolve(listen)?;
-        let known = security.access.restricted() || security.tls.as_ref().is_some_and(|tls| tls.mutual);
+        let known = security.access.restricted() || security.mutual();
         if address.ip().is_loopback() || self.insecure || (security.tls.is_some() && known) {
             return Ok(());
         }

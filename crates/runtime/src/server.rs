@@ -5,7 +5,8 @@ use crate::exit::{self, Failure};
 pub use crate::net::connections::Incoming;
 use crate::net::connections::{ConnectionLimits, Connections};
 use crate::net::guard::Guard;
-use crate::tls::{ServerTls, unusable};
+use crate::net::socket::Sockets;
+use crate::tls::ServerTls;
 use std::future::Future;
 use std::io::{Error, ErrorKind};
 use std::net::{SocketAddr, ToSocketAddrs as _};
@@ -58,14 +59,6 @@ pub fn builder() -> Server {
         .initial_connection_window_size(16 << 20)
 }
 
-/// [`builder`], with TLS if there are certificates.
-pub fn secure_builder(tls: Option<&ServerTls>) -> Result<Server, Failure> {
-    match tls {
-        Some(tls) => builder().tls_config(tls.config.clone()).map_err(unusable),
-        None => Ok(builder()),
-    }
-}
-
 /// Resolves `host:port`.
 pub fn resolve(listen: &str) -> Result<SocketAddr, Failure> {
     resolve_for(listen, LISTEN).map_err(Failure::usage)
@@ -79,15 +72,18 @@ fn resolve_for(listen: &str, option: &str) -> Result<SocketAddr, String> {
     })
 }
 
-/// Serves until `shutdown`, then stops accepting, waits at most `grace` for open calls, and drops the rest.
+/// Serves until `shutdown`, then stops accepting, waits at most `grace` for open calls, and drops the rest. With certificates,
+/// connections are encrypted.
 pub fn serve(
     router: Router,
     incoming: Incoming,
+    tls: Option<ServerTls>,
     shutdown: CancellationToken,
     grace: Duration,
 ) -> Boxed<'static, Result<(), tonic::transport::Error>> {
     Box::pin(async move {
-        let serving = router.serve_with_incoming_shutdown(incoming, shutdown.clone().cancelled_owned());
+        let serving =
+            router.serve_with_incoming_shutdown(Sockets::new(incoming, tls), shutdown.clone().cancelled_owned());
         match within(serving, shutdown, grace).await {
             Some(result) => result,
             None => {
@@ -110,9 +106,10 @@ pub(crate) async fn within<T>(
     }
 }
 
-/// Adds reflection (v1, and v1alpha for older tools) for an encoded descriptor set and for health.
+/// Adds reflection (v1, and v1alpha for older tools): it lists `service`, which the encoded descriptors describe, and health.
 pub fn with_reflection(
     router: Router,
+    service: &str,
     descriptors: &'static [u8],
     connections: &Connections,
 ) -> Result<Router, ReflectionError> {
@@ -120,6 +117,9 @@ pub fn with_reflection(
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(descriptors)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+            // The descriptors have the services of other processes, too.
+            .with_service_name(service)
+            .with_service_name(tonic_health::pb::health_server::SERVICE_NAME)
     };
     let router = router.add_service(Guard::public(describe().build_v1()?, connections.clone()));
     Ok(router.add_service(Guard::public(describe().build_v1alpha()?, connections.clone())))
@@ -145,7 +145,7 @@ mod tests {
         let (_health, service) = crate::health::Health::new::<Named>().await;
         let shutdown = CancellationToken::new();
         let router = builder().add_service(service);
-        let server = tokio::spawn(serve(router, incoming, shutdown.clone(), Duration::from_millis(100)));
+        let server = tokio::spawn(serve(router, incoming, None, shutdown.clone(), Duration::from_millis(100)));
         let _idle = tokio::net::TcpStream::connect(address).await.unwrap();
         tokio::time::sleep(Duration::from_millis(50)).await;
         let start = Instant::now();

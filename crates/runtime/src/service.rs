@@ -3,13 +3,16 @@
 
 use crate::exit::{self, Failure};
 use crate::http::{HttpArgs, Page, Router};
+use crate::metrics::Metrics;
 use crate::net::connections::ConnectionLimits;
+use crate::reload::{self, Source};
 use crate::server::{self, Incoming};
 use crate::telemetry::{self, LogFormat, TraceArgs};
 use crate::{limits, process, shutdown};
 use clap::Args;
 use serde::Serialize;
 use std::net::SocketAddr;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
@@ -49,6 +52,9 @@ pub struct Context {
     name: &'static str,
     address: Option<SocketAddr>,
     page: Option<Page>,
+    http: Option<SocketAddr>,
+    /// Until [`Self::reload`] takes it. It exists from the start, so that a SIGHUP never ends a service.
+    hangup: Option<Signal>,
 }
 
 impl Context {
@@ -64,10 +70,23 @@ impl Context {
         self.page.is_some()
     }
 
-    /// Prints the ready line, and serves `routes` on the operators' address if there is one.
-    pub fn announce(&mut self, routes: Router) -> Option<JoinHandle<()>> {
-        process::announce_ready(self.name, self.address, self.page.as_ref().map(Page::address));
+    /// Serves `routes` on the operators' address, if there is one.
+    pub fn serve_page(&mut self, routes: Router) -> Option<JoinHandle<()>> {
         self.page.take().map(|page| page.serve(routes, self.stop.clone()))
+    }
+
+    /// Prints the ready line: everything that was asked for is open.
+    pub fn announce(&self) {
+        process::announce_ready(self.name, self.address, self.http);
+    }
+
+    /// Reads these files again on SIGHUP, and when they change, until the service ends.
+    pub fn reload(&mut self, sources: Vec<Source>, metrics: &Metrics) {
+        let help = "First end of a certificate in use, in seconds since unix epoch; +Inf without certificates.";
+        let end = metrics.gauge("process_certificate_end_time_seconds", help);
+        if let Some(hangup) = self.hangup.take() {
+            tokio::spawn(reload::follow(sources, hangup, end));
+        }
     }
 }
 
@@ -95,9 +114,11 @@ pub fn main<T>(
     };
     process::log_environment();
     let result = runtime.block_on(async {
+        let hangup = Some(signal(SignalKind::hangup()).map_err(internal)?);
         let stop = shutdown::on_signal().map_err(internal)?;
         let page = args.http.bind().await?;
-        run(Context { stop, name, address: None, page }).await
+        let http = page.as_ref().map(Page::address);
+        run(Context { stop, name, address: None, page, http, hangup }).await
     });
     telemetry.flush();
     // A thread that still works must not delay the end.

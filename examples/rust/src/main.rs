@@ -5,8 +5,11 @@
 //! cargo run -p magex-example-client -- http://127.0.0.1:7100
 //! ```
 //!
-//! `MAGEX_TOKEN` holds a bearer token if the service wants one, `MAGEX_TLS_CA` names the authority of an https service.
+//! `MAGEX_TOKEN` holds a bearer token if the service wants one. `MAGEX_TLS_CA` names the authority of an https service, and
+//! `MAGEX_TLS_CERT` and `MAGEX_TLS_KEY` the client's own certificate and key if it wants one (PEM files).
 #![allow(clippy::print_stdout, reason = "an example talks")]
+
+mod connect;
 
 use anyhow::Context as _;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
@@ -15,20 +18,15 @@ use magex_proto::v1::{
     Positions, UpdateMissionRequest, WatchAssignmentsRequest, WatchKind,
 };
 use tonic::metadata::{Ascii, MetadataValue};
-use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
 use tonic::{Request, Status};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let url = std::env::args().nth(1).unwrap_or_else(|| "http://127.0.0.1:7100".to_owned());
-    let mut endpoint = Endpoint::from_shared(url.clone())?.connect_timeout(std::time::Duration::from_secs(3));
-    if let Some(path) = std::env::var_os("MAGEX_TLS_CA") {
-        let ca = Certificate::from_pem(std::fs::read(path)?);
-        endpoint = endpoint.tls_config(ClientTlsConfig::new().ca_certificate(ca))?;
-    }
-    let channel = endpoint.connect().await.with_context(|| format!("no commander at {url}"))?;
-    let token = std::env::var("MAGEX_TOKEN").ok();
-    let bearer: Option<MetadataValue<Ascii>> = token.map(|token| format!("Bearer {token}").parse()).transpose()?;
+    let channel = connect::to(&url).await?;
+    let token = std::env::var("MAGEX_TOKEN").ok().filter(|token| !token.trim().is_empty());
+    let bearer: Option<MetadataValue<Ascii>> =
+        token.map(|token| format!("Bearer {}", token.trim()).parse()).transpose()?;
     let mut client = CommanderServiceClient::with_interceptor(channel, move |mut request: Request<()>| {
         if let Some(bearer) = &bearer {
             request.metadata_mut().insert("authorization", bearer.clone());

@@ -3,6 +3,7 @@
 use crate::run_events::RunEvent;
 use crate::serve::patience;
 use magex_proto::v1;
+use magex_runtime::net::heartbeat::Heartbeat;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
@@ -55,6 +56,7 @@ impl Events {
         reader: mpsc::Sender<Result<v1::WatchRunResponse, Status>>,
         closing: CancellationToken,
         patience: Duration,
+        mut heartbeat: Heartbeat,
     ) {
         let mut log = self.0.subscribe();
         let mut next = 0;
@@ -66,6 +68,10 @@ impl Events {
                     changed = log.changed() => if changed.is_err() { return },
                     () = reader.closed() => return,
                     () = closing.cancelled() => return,
+                    () = heartbeat.due() => {
+                        // A queue with messages in it needs no heartbeat.
+                        let _ = reader.try_send(Ok(v1::WatchRunResponse { sequence: next, event: None }));
+                    }
                 }
                 continue;
             }
@@ -93,7 +99,12 @@ mod tests {
             events.push(RunEvent::Log(i.to_string()));
         }
         let (tx, mut rx) = mpsc::channel(4);
-        tokio::spawn(events.clone().stream(tx, CancellationToken::new(), Duration::from_secs(60)));
+        tokio::spawn(events.clone().stream(
+            tx,
+            CancellationToken::new(),
+            Duration::from_secs(60),
+            Heartbeat::new(None),
+        ));
         for i in 5..KEPT + 5 {
             let got = rx.recv().await.unwrap().unwrap();
             assert_eq!(got.sequence, i as u64);
@@ -109,7 +120,7 @@ mod tests {
         let events = Arc::new(Events::default());
         (0..9).for_each(|i| events.push(RunEvent::Log(i.to_string())));
         let (tx, mut rx) = mpsc::channel(4);
-        events.stream(tx, CancellationToken::new(), Duration::from_millis(20)).await;
+        events.stream(tx, CancellationToken::new(), Duration::from_millis(20), Heartbeat::new(None)).await;
         for i in 0..4 {
             assert_eq!(rx.recv().await.unwrap().unwrap().sequence, i);
         }

@@ -9,13 +9,14 @@ use crate::serve::session;
 use crate::serve::shared::Shared;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board;
-use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer};
+use magex_proto::v1::learner_service_server::{LearnerService, LearnerServiceServer, SERVICE_NAME};
 use magex_proto::{FILE_DESCRIPTOR_SET, MAX_MESSAGE_BYTES, v1};
-use magex_runtime::exit::Failure;
 use magex_runtime::health::Health;
 use magex_runtime::http::{self, Router};
-use magex_runtime::net::auth::{Role, caller};
+use magex_runtime::metrics::Metrics;
+use magex_runtime::net::auth::{Role, caller, peer_address};
 use magex_runtime::net::guard::{Guard, Rules};
+use magex_runtime::net::heartbeat::Heartbeat;
 use magex_runtime::net::in_flight::{InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
@@ -45,7 +46,7 @@ pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, Grpc
         }
     });
     let collector = GrpcCollector { shared: shared.clone(), timing: CollectTiming::default() };
-    (LearnerHandle { shared, security: Security::default() }, collector)
+    (LearnerHandle { shared, security: Security::default(), heartbeat: None }, collector)
 }
 
 /// The network's end of the service.
@@ -53,14 +54,12 @@ pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, Grpc
 pub struct LearnerHandle {
     shared: Arc<Shared>,
     security: Security,
+    heartbeat: Option<Duration>,
 }
 
 /// Why serving failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The certificates are invalid.
-    #[error("tls: {0}")]
-    Tls(#[from] Failure),
     /// The server failed.
     #[error("the learner's server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
@@ -74,6 +73,12 @@ impl LearnerHandle {
     #[must_use]
     pub fn guarded(self, security: Security) -> Self {
         Self { security, ..self }
+    }
+
+    /// Sets the time between heartbeats on streams.
+    #[must_use]
+    pub fn beating(self, heartbeat: Option<Duration>) -> Self {
+        Self { heartbeat, ..self }
     }
 
     /// Serves until `shutdown`. Then the trainer stops, actors receive the reason, streams end, and the call returns within
@@ -90,10 +95,10 @@ impl LearnerHandle {
             message_bytes: MAX_MESSAGE_BYTES,
             calls: None,
         };
-        let router = server::secure_builder(self.security.tls.as_ref())?
+        let router = server::builder()
             .add_service(Guard::public(health_service, connections.clone()))
             .add_service(Guard::guarded(service, rules, connections.clone()));
-        let router = server::with_reflection(router, FILE_DESCRIPTOR_SET, &connections)?;
+        let router = server::with_reflection(router, SERVICE_NAME, FILE_DESCRIPTOR_SET, &connections)?;
         let shared = self.shared.clone();
         let stopped = shutdown.clone();
         let stopping = tokio::spawn(async move {
@@ -106,10 +111,15 @@ impl LearnerHandle {
             health.set(false).await;
             shared.close();
         });
-        let served = server::serve(router, incoming, shutdown, server::GRACE).await;
+        let served = server::serve(router, incoming, self.security.tls.clone(), shutdown, server::GRACE).await;
         stopping.abort();
         self.close();
         Ok(served?)
+    }
+
+    /// Where the service counts.
+    pub fn metrics(&self) -> &Metrics {
+        &self.shared.registry
     }
 
     /// Health and metrics over plain HTTP.
@@ -153,7 +163,7 @@ impl LearnerService for LearnerHandle {
     async fn rollout(&self, request: Request<Streaming<v1::RolloutRequest>>) -> Result<Response<Self::RolloutStream>> {
         caller(&request, &[Role::Actor])?;
         self.check_open()?;
-        let address = request.remote_addr().map_or_else(String::new, |address| address.to_string());
+        let address = peer_address(request.extensions()).map_or_else(String::new, |address| address.to_string());
         let (outbound, stream) = mpsc::channel(64);
         tokio::spawn(session::serve(self.shared.clone(), address, request.into_inner(), outbound));
         Ok(Response::new(ReceiverStream::new(stream)))
@@ -180,7 +190,7 @@ impl LearnerService for LearnerHandle {
         let board = self.shared.board.subscribe();
         let (closing, toml) = (self.shared.control.closing.clone(), self.shared.run.run_config_toml.clone());
         let (shared, patience) = (self.shared.clone(), self.shared.lease_time());
-        let subscribed = shared.metrics.subscriber(request.role());
+        let (subscribed, beat) = (shared.metrics.subscriber(request.role()), Heartbeat::new(self.heartbeat));
         tokio::spawn(async move {
             let _subscribed = subscribed;
             let sent = |version| {
@@ -188,7 +198,7 @@ impl LearnerService for LearnerHandle {
                     shared.metrics.weights_published.observe(since.elapsed().as_secs_f64());
                 }
             };
-            closing.run_until_cancelled(weights_board::stream(board, toml, reader, patience, sent)).await;
+            closing.run_until_cancelled(weights_board::stream(board, toml, reader, patience, beat, sent)).await;
             drop(permit);
         });
         Ok(Response::new(ReceiverStream::new(stream)))
@@ -206,7 +216,7 @@ impl LearnerService for LearnerHandle {
         let permit = self.shared.watcher()?;
         let (reader, stream) = mpsc::channel(64);
         let (events, closing) = (self.shared.events.clone(), self.shared.control.closing.clone());
-        let sending = events.stream(reader, closing, self.shared.lease_time());
+        let sending = events.stream(reader, closing, self.shared.lease_time(), Heartbeat::new(self.heartbeat));
         tokio::spawn(async move {
             sending.await;
             drop(permit);

@@ -4,6 +4,7 @@ use crate::serve::patience;
 use magex_core::ids::WeightsVersion;
 use magex_proto::v1::WatchWeightsResponse;
 pub use magex_proto::weights::Weights;
+use magex_runtime::net::heartbeat::Heartbeat;
 use magex_runtime::sync::lock;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -80,6 +81,7 @@ pub(crate) async fn stream(
     run_config_toml: String,
     reader: mpsc::Sender<Result<WatchWeightsResponse, Status>>,
     patience: Duration,
+    mut heartbeat: Heartbeat,
     sent_newer: impl Fn(WeightsVersion),
 ) {
     let mut sent: Option<Arc<Weights>> = None;
@@ -100,6 +102,10 @@ pub(crate) async fn stream(
             None => tokio::select! {
                 changed = board.changed() => if changed.is_err() { return },
                 () = reader.closed() => return,
+                () = heartbeat.due() => {
+                    // A queue with messages in it needs no heartbeat.
+                    let _ = reader.try_send(Ok(WatchWeightsResponse::default()));
+                }
             },
         }
     }
@@ -149,7 +155,14 @@ mod tests {
     async fn a_slow_reader_skips_to_the_latest_two() {
         let board = published([1]);
         let (tx, mut rx) = mpsc::channel(1);
-        tokio::spawn(stream(board.subscribe(), String::new(), tx, Duration::from_secs(60), |_| ()));
+        tokio::spawn(stream(
+            board.subscribe(),
+            String::new(),
+            tx,
+            Duration::from_secs(60),
+            Heartbeat::new(None),
+            |_| (),
+        ));
         assert_eq!(rx.recv().await.unwrap().unwrap().version, 1);
         (2..=100).for_each(|version| board.publish(weights(version)));
         let mut seen = vec![];
@@ -164,7 +177,7 @@ mod tests {
         let board = published([1, 2]);
         let (tx, mut rx) = mpsc::channel(1);
         // The channel has no room for the second version.
-        stream(board.subscribe(), String::new(), tx, Duration::from_millis(20), |_| ()).await;
+        stream(board.subscribe(), String::new(), tx, Duration::from_millis(20), Heartbeat::new(None), |_| ()).await;
         assert_eq!(rx.recv().await.unwrap().unwrap().version, 1);
         assert!(rx.recv().await.is_none());
     }

@@ -12,7 +12,6 @@ use magex_learner::run_events::RunEvent;
 use magex_proto::v1;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_proto::weights::Weights;
-use magex_runtime::client;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
@@ -74,7 +73,7 @@ async fn a_watcher_that_reads_nothing_loses_its_place_and_its_stream() {
     };
     publish(&mut learner, 0);
     // A connection of its own with small windows: what is not read does not fit into them.
-    let endpoint = client::endpoint(&learner.url).unwrap();
+    let endpoint = tonic::transport::Endpoint::from_shared(learner.url.clone()).unwrap();
     let endpoint = endpoint.initial_stream_window_size(64 << 10).initial_connection_window_size(64 << 10);
     let mut stalled = v1::learner_service_client::LearnerServiceClient::new(endpoint.connect().await.unwrap())
         .max_decoding_message_size(8 << 20);

@@ -86,17 +86,22 @@ async fn many_teams_and_streams_of_teams() {
     let teams = vec![team(), wrong.clone()];
     let status = client.assign_many(v1::AssignManyRequest { teams }).await.unwrap_err();
     assert_eq!(field(&status), "teams[1].goals.coordinates[1]");
-    assert_eq!(field(&client.assign_many(v1::AssignManyRequest::default()).await.unwrap_err()), "teams");
-    let request = v1::AssignManyRequest { teams: vec![team(); 3] };
-    assert_eq!(client.assign_many(request).await.unwrap().into_inner().answers.len(), 3);
+    assert_eq!(client.assign_many(v1::AssignManyRequest::default()).await.unwrap().into_inner().answers, []);
+    // A team without goals harms no other.
+    let idle = v1::AssignRequest { goals: positions(&[]), ..team() };
+    let request = v1::AssignManyRequest { teams: vec![team(), idle.clone(), team()] };
+    let answers = client.assign_many(request).await.unwrap().into_inner().answers;
+    assert_eq!(answers.iter().map(goals).collect::<Vec<_>>(), [vec![1, 0], vec![], vec![1, 0]]);
+    assert_eq!((answers[1].cost, answers[1].unassigned_agents.as_slice()), (0.0, &[0, 1][..]));
+    assert_eq!(answers[1].agents_without_goal[0].reason(), v1::UnassignedReason::Outnumbered);
 
     let (sender, receiver) = tokio::sync::mpsc::channel(4);
     let mut answers = client.assign_stream(ReceiverStream::new(receiver)).await.unwrap().into_inner();
-    for (sequence, team) in [(7, Some(team())), (8, Some(wrong)), (9, None), (10, Some(team()))] {
+    for (sequence, team) in [(7, Some(team())), (8, Some(wrong)), (9, None), (10, Some(idle)), (11, Some(team()))] {
         sender.send(v1::AssignStreamRequest { sequence, team }).await.unwrap();
     }
     let mut seen = Vec::new();
-    for _ in 0..4 {
+    for _ in 0..5 {
         let answer = within(answers.message()).await.unwrap().unwrap();
         seen.push((
             answer.sequence,
@@ -110,7 +115,7 @@ async fn many_teams_and_streams_of_teams() {
         ));
     }
     let text: Vec<(u64, &str)> = seen.iter().map(|(k, text)| (*k, text.as_str())).collect();
-    assert_eq!(text, [(7, "[1, 0]"), (8, "team.goals.coordinates[1]"), (9, "team"), (10, "[1, 0]")]);
+    assert_eq!(text, [(7, "[1, 0]"), (8, "team.goals.coordinates[1]"), (9, "team"), (10, "[]"), (11, "[1, 0]")]);
     // The service drains: the stream ends and says why.
     commander.shutdown.cancel();
     let status = within(answers.message()).await.unwrap_err();

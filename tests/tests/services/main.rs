@@ -18,3 +18,4 @@ mod security;
 mod stopping;
 mod swaps;
 mod weights;
+mod wire;

@@ -114,6 +114,7 @@ pub(crate) struct LearnerOptions {
     pub(crate) task: TaskConfig,
     pub(crate) max_episodes: usize,
     pub(crate) security: Security,
+    pub(crate) heartbeat: Option<Duration>,
 }
 
 impl Default for LearnerOptions {
@@ -128,6 +129,7 @@ impl Default for LearnerOptions {
             task: task(),
             max_episodes: 2,
             security,
+            heartbeat: None,
         }
     }
 }
@@ -154,6 +156,7 @@ impl Learner {
         let (handle, collector) = learner_service(run, limits);
         let (incoming, address) = server::bind(&options.listen).await.unwrap();
         let shutdown = CancellationToken::new();
+        let handle = handle.beating(options.heartbeat);
         let (served, token) = (handle.clone().guarded(options.security), shutdown.clone());
         let serving = tokio::spawn(async move { served.serve(incoming, token).await.unwrap() });
         Self { url: format!("http://{address}"), address, handle, collector, shutdown, serving }
@@ -296,6 +299,7 @@ pub(crate) fn config(learner_url: &str, name: &str) -> ActorConfig {
         threads: 1,
         expected_task: None,
         stay: false,
+        accepted: tokio_util::sync::CancellationToken::new(),
     }
 }
 

@@ -8,7 +8,9 @@ use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
+use magex_proto::{COMMANDER, SERVICES};
 use magex_runtime::exit;
+use magex_runtime::peer::Remote;
 use magex_runtime::security::CallerArgs;
 use serde::Deserialize;
 use serde_json::json;
@@ -104,15 +106,14 @@ pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<
     let settings = args.security.read().map_err(usage)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let clock = Instant::now();
+    let commander = Remote { url: args.connect.clone(), settings, wanted: COMMANDER, known: &SERVICES };
     let response = runtime.block_on(async {
-        let channel = settings.connect(&args.connect).await.map_err(|error| match error.code {
-            exit::USAGE => usage(format!("--connect: {error}")),
-            _ => unavailable(format!("no commander at {}: {error}; start one with `magex commander`", args.connect)),
-        })?;
+        let channel = commander.channel().map_err(|error| usage(format!("--connect: {error}")))?;
         let mut client = CommanderServiceClient::new(channel);
         let call = client.assign(request);
         match tokio::time::timeout(Duration::from_secs(30), call).await {
-            Ok(answer) => answer.map(tonic::Response::into_inner).map_err(|status| rejected(&args.connect, &status)),
+            Ok(Ok(answer)) => Ok(answer.into_inner()),
+            Ok(Err(status)) => Err(rejected(&commander, &status).await),
             Err(_) => Err(unavailable(format!("the commander at {} did not answer within 30 s", args.connect))),
         }
     })?;
@@ -120,12 +121,16 @@ pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<
     Ok(exit::OK)
 }
 
-fn rejected(url: &str, status: &Status) -> anyhow::Error {
+async fn rejected(commander: &Remote, status: &Status) -> anyhow::Error {
+    let explained = commander.explain(status).await;
     match status.code() {
         Code::InvalidArgument => usage(status.message()),
-        Code::Unavailable | Code::DeadlineExceeded | Code::Unimplemented => {
-            unavailable(format!("{url}: {}", status.message()))
+        // A status that was explained is not the commander's own.
+        _ if explained.text != status.message() => {
+            let start = if explained.permanent { "" } else { "; start one with `magex commander`" };
+            unavailable(format!("no commander at {}: {}{start}", commander.url, explained.text))
         }
+        Code::Unavailable | Code::DeadlineExceeded => unavailable(format!("{}: {}", commander.url, status.message())),
         code => anyhow::anyhow!("the commander rejected the request: {code}: {}", status.message()),
     }
 }
@@ -228,7 +233,8 @@ fn read(field: &str, text: &str) -> anyhow::Result<String> {
 }
 
 fn positions(field: &str, points: &[Vec<f32>]) -> anyhow::Result<v1::Positions> {
-    let dims = points.first().map_or(0, Vec::len);
+    // An empty side is answered, too: the members of the other one are left over.
+    let dims = points.first().map_or(2, Vec::len);
     if !(2..=3).contains(&dims) {
         return Err(usage(format!("{field}: points of 2 or 3 coordinates are needed, the first has {dims}")));
     }
@@ -246,8 +252,9 @@ mod tests {
     #[test]
     fn points_must_agree_in_their_dimensions() {
         assert_eq!(positions("agents", &[vec![1.0, 2.0], vec![3.0, 4.0]]).unwrap().coordinates, [1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(positions("agents", &[]).unwrap(), v1::Positions { dims: 2, ..Default::default() });
         for (points, words) in [
-            (vec![], "the first has 0"),
+            (vec![vec![]], "the first has 0"),
             (vec![vec![1.0]], "the first has 1"),
             (vec![vec![1.0, 2.0], vec![1.0]], "agents[1]: 1 coordinates"),
         ] {

@@ -16,7 +16,8 @@ https uses MAGEX_TLS_CA, MAGEX_TLS_CERT and MAGEX_TLS_KEY. magex-learner,
 magex-commander and magex-actor check themselves with --health-check, at the
 address in their own options and environment.
 
-Exit codes: 0 serving, 1 not serving or no answer in time, 64 wrong usage";
+Exit codes: 0 serving, 1 not serving, 64 wrong usage, 69 no service answers
+there, or another one";
 
 /// Check the health of a service, for orchestrators.
 #[derive(Debug, Clone, clap::Args)]

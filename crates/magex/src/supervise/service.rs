@@ -36,6 +36,7 @@ pub struct Service<'a> {
     arguments: Vec<String>,
     log: PathBuf,
     inherit: Option<BorrowedFd<'a>>,
+    awaited: bool,
 }
 
 /// One child is started at a time: an inherited descriptor is open to every child that is started meanwhile.
@@ -60,7 +61,7 @@ impl<'a> Service<'a> {
     /// The command line `magex <arguments>`; standard error is appended to `<name>.log` in `logs`.
     pub fn new(name: &str, arguments: &[&str], logs: &Path) -> Self {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")), inherit: None }
+        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")), inherit: None, awaited: true }
     }
 
     /// The service gets this open file under the same number.
@@ -77,7 +78,13 @@ impl<'a> Service<'a> {
         child
     }
 
-    /// Starts it and waits until it is ready.
+    /// Its start does not wait for the ready line: an actor's comes when a learner has accepted it.
+    #[must_use]
+    pub(crate) fn unawaited(self) -> Self {
+        Self { awaited: false, ..self }
+    }
+
+    /// Starts it and waits until it is ready, unless it is not awaited.
     pub async fn start(&self) -> anyhow::Result<Running> {
         let open = || OpenOptions::new().create(true).append(true).open(&self.log);
         let log = open().with_context(|| self.log.display().to_string())?;
@@ -103,6 +110,9 @@ impl<'a> Service<'a> {
         let (stdout, stdin) = (child.stdout.take(), child.stdin.take());
         let (name, log) = (self.name.clone(), self.log.clone());
         let mut running = Running { name, child, _stdin: stdin, log, log_start, address: String::new(), http: None };
+        if !self.awaited {
+            return Ok(running);
+        }
         let ready = async {
             let mut lines = BufReader::new(stdout?).lines();
             let line = lines.next_line().await.ok()??;

@@ -1,8 +1,9 @@
 //! Health check of a service, for orchestrators that run it inside the service's container.
 
 use crate::Boxed;
-use crate::client::{endpoint_from_env, root_of};
+use crate::client::{Settings, endpoint_from_env};
 use crate::exit::{self, Failure};
+use crate::peer;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -28,13 +29,19 @@ pub fn ask<'a>(url: &'a str, service: &'a str, deadline: Duration) -> Boxed<'a, 
         }
     };
     Box::pin(async move {
-        let late = |_| unhealthy(format!("{url} did not answer within {} s", deadline.as_secs_f64()));
+        let late = |_| absent(format!("{url} did not answer within {} s", deadline.as_secs_f64()));
         tokio::time::timeout(deadline, asking).await.map_err(late)?
     })
 }
 
+/// The service is there and not healthy.
 fn unhealthy(problem: String) -> Failure {
     Failure::new(exit::FAILURE, problem)
+}
+
+/// No service answers there, or something else does.
+fn absent(problem: String) -> Failure {
+    Failure::new(exit::UNAVAILABLE, problem)
 }
 
 /// [`ask`] on its own runtime. Returns the exit code.
@@ -46,10 +53,17 @@ pub fn run(url: &str, service: &str, deadline: Duration) -> Result<u8, Failure> 
     runtime.block_on(ask(url, service, deadline)).map(|()| exit::OK)
 }
 
-/// Checks the service that was started on this machine with these options.
+/// Checks the service that was started on this machine with these options. For orchestrators: every failure has one code.
 pub fn own(listen: &str, secure: bool) -> Result<u8, Failure> {
     let scheme = if secure { "https" } else { "http" };
-    run(&format!("{scheme}://{}", reachable(listen)), "", DEADLINE)
+    check_own(&format!("{scheme}://{}", reachable(listen)))
+}
+
+fn check_own(url: &str) -> Result<u8, Failure> {
+    run(url, "", DEADLINE).map_err(|error| match error.code {
+        exit::UNAVAILABLE => unhealthy(error.message),
+        _ => error,
+    })
 }
 
 /// Checks the HTTP server of the program that was started on this machine with these options. A missing address is wrong usage.
@@ -57,7 +71,7 @@ pub fn own_page(listen: Option<&str>) -> Result<u8, Failure> {
     let listen = listen.ok_or_else(|| {
         Failure::usage("--health-check: needs the address of the HTTP server; set --http or MAGEX_HTTP")
     })?;
-    run(&format!("http://{}/healthz", reachable(listen)), "", DEADLINE)
+    check_own(&format!("http://{}/healthz", reachable(listen)))
 }
 
 /// The address of a listener from its own machine. Loopback addresses become `localhost`, because certificates contain names.
@@ -81,14 +95,18 @@ fn page_of(url: &str) -> Option<(&str, &str)> {
 }
 
 async fn ask_grpc(url: &str, service: &str) -> Result<(), Failure> {
-    let unreachable = |reason: String| unhealthy(format!("{url}: {reason}"));
     let endpoint = endpoint_from_env(url)?;
-    let channel = endpoint.connect().await.map_err(|error| unreachable(root_of(&error)))?;
     let request = HealthCheckRequest { service: service.to_owned() };
-    let answer = HealthClient::new(channel).check(request).await.map_err(|status| match status.code() {
-        Code::NotFound => unreachable(format!("no service '{service}'")),
-        code => unreachable(format!("{code:?}: {}", status.message())),
-    })?;
+    let answer = match HealthClient::new(endpoint.connect_lazy()).check(request).await {
+        Ok(answer) => answer,
+        Err(status) if status.code() == Code::NotFound => {
+            return Err(unhealthy(format!("{url}: no service '{service}'")));
+        }
+        Err(status) => {
+            let settings = Settings { tls: endpoint.tls().map(|(tls, _)| tls.clone()), ..Settings::default() };
+            return Err(absent(peer::explain(&settings, url, "magex service", &[], &status).await.text));
+        }
+    };
     match answer.into_inner().status() {
         ServingStatus::Serving => Ok(()),
         other => Err(unhealthy(format!("{url} reports {}", other.as_str_name()))),
@@ -96,7 +114,7 @@ async fn ask_grpc(url: &str, service: &str) -> Result<(), Failure> {
 }
 
 async fn ask_page(url: &str, authority: &str, path: &str) -> Result<(), Failure> {
-    let unreachable = |error: std::io::Error| unhealthy(format!("{url}: {error}"));
+    let unreachable = |error: std::io::Error| absent(format!("{url}: {error}"));
     let mut socket = TcpStream::connect(authority).await.map_err(unreachable)?;
     let request = format!("GET {path} HTTP/1.0\r\nHost: {authority}\r\n\r\n");
     socket.write_all(request.as_bytes()).await.map_err(unreachable)?;
@@ -131,7 +149,7 @@ mod tests {
         let (health, service) = Health::new::<Named>().await;
         let stop = CancellationToken::new();
         let router = server::builder().add_service(service);
-        let serving = tokio::spawn(server::serve(router, incoming, stop.clone(), Duration::ZERO));
+        let serving = tokio::spawn(server::serve(router, incoming, None, stop.clone(), Duration::ZERO));
         let url = format!("http://{address}");
         for (healthy, service) in [(false, ""), (true, ""), (true, "test.Named"), (false, "test.Named")] {
             health.set(healthy).await;
@@ -144,7 +162,7 @@ mod tests {
         stop.cancel();
         serving.await.unwrap().unwrap();
         let error = ask(&url, "", SOON).await.unwrap_err();
-        assert!(error.code == exit::FAILURE && error.message.starts_with(&format!("{url}: ")), "{error}");
+        assert!(error.code == exit::UNAVAILABLE && error.message.contains("nothing listens at 127.0.0.1:"), "{error}");
     }
 
     #[tokio::test]
@@ -166,7 +184,10 @@ mod tests {
         let address = mute.local_addr().unwrap();
         for url in [format!("http://{address}"), format!("http://{address}/healthz")] {
             let error = ask(&url, "", Duration::from_millis(200)).await.unwrap_err();
-            assert!(error.code == exit::FAILURE && error.message.contains("did not answer within 0.2 s"), "{error}");
+            assert!(
+                error.code == exit::UNAVAILABLE && error.message.contains("did not answer within 0.2 s"),
+                "{error}"
+            );
         }
     }
 

@@ -10,6 +10,7 @@
 //! ```
 
 use crate::exit::Failure;
+use crate::sync::Live;
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
@@ -17,8 +18,10 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use tonic::codegen::http;
-use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo};
 use tonic::{Request, Status};
+
+pub(crate) const NEEDS_CLIENT_CA: &str =
+    "--identities: certificate_sha256 needs --client-ca, so that callers present their certificates";
 
 /// What a caller may do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -43,13 +46,29 @@ pub struct Caller {
     pub role: Role,
 }
 
-/// The identities that may call.
+/// The caller of a call, as its connection shows it.
+#[derive(Debug, Clone)]
+pub struct Peer {
+    /// Its address.
+    pub address: SocketAddr,
+    /// SHA-256 of its certificate (DER), lower-case hex.
+    pub certificate: Option<Arc<str>>,
+}
+
+/// The identities that may call. They can be read again while they are in use; the next call of a caller counts.
 #[derive(Debug, Clone, Default)]
 pub struct Access {
-    /// By SHA-256, lower-case hex. `None`: every caller that passes TLS is an admin.
-    known: Option<HashMap<String, Caller>>,
+    /// Their file. Without one every caller that passes TLS is an admin.
+    path: Option<Arc<Path>>,
+    live: Live<Identities>,
+}
+
+#[derive(Debug, Default)]
+struct Identities {
+    /// By SHA-256, lower-case hex.
+    known: HashMap<String, Caller>,
     /// At least one identity is known by its certificate, so the server must request client certificates.
-    pub(crate) certificates: bool,
+    certificates: bool,
 }
 
 #[derive(Deserialize)]
@@ -71,9 +90,74 @@ struct Identity {
 impl Access {
     /// Reads a file of identities.
     pub fn read(path: &Path) -> Result<Self, Failure> {
+        Ok(Self { path: Some(path.into()), live: Live::new(Identities::read(path)?) })
+    }
+
+    /// Reads the file again. If it cannot be used, nothing changes. `mutual` says whether client certificates are requested.
+    pub(crate) fn reload(&self, mutual: bool) -> Result<(), Failure> {
+        let Some(path) = &self.path else { return Ok(()) };
+        let identities = Identities::read(path)?;
+        if identities.certificates && !mutual {
+            return Err(Failure::usage(NEEDS_CLIENT_CA));
+        }
+        self.live.set(identities);
+        Ok(())
+    }
+
+    /// The file of the identities.
+    pub(crate) fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// At least one identity is known by its certificate.
+    pub(crate) fn certificates(&self) -> bool {
+        self.live.get().certificates
+    }
+
+    /// Callers must authenticate.
+    pub fn restricted(&self) -> bool {
+        self.path.is_some()
+    }
+
+    /// Authenticates a call by its `authorization` header, or else by its client certificate.
+    /// Missing or unknown credentials are UNAUTHENTICATED.
+    pub fn authenticate<T>(&self, request: &http::Request<T>) -> Result<Caller, Status> {
+        let peer = request.extensions().get::<Peer>();
+        let certificate = peer.and_then(|peer| peer.certificate.as_deref());
+        if !self.restricted() {
+            let name = match (certificate, peer) {
+                (Some(hash), _) => format!("certificate-{}", &hash[..16]),
+                (None, Some(peer)) => peer.address.ip().to_string(),
+                (None, None) => "local".to_owned(),
+            };
+            return Ok(Caller { name: name.into(), role: Role::Admin });
+        }
+        let identities = self.live.get();
+        let known = &identities.known;
+        if let Some(value) = request.headers().get("authorization") {
+            // Only digests are compared, so the duration reveals nothing about a token.
+            let token = value.to_str().ok().and_then(|text| text.strip_prefix("Bearer "));
+            let caller = token.and_then(|token| known.get(&sha256_hex(token.trim().as_bytes())));
+            return caller.cloned().ok_or_else(|| {
+                Status::unauthenticated(
+                    "authorization: unknown bearer token; check the token, or add its SHA-256 to --identities",
+                )
+            });
+        }
+        let caller = certificate.and_then(|hash| known.get(hash));
+        caller.cloned().ok_or_else(|| {
+            Status::unauthenticated(
+                "authorization: missing; send 'authorization: Bearer TOKEN', or connect with a client certificate listed in --identities",
+            )
+        })
+    }
+}
+
+impl Identities {
+    fn read(path: &Path) -> Result<Self, Failure> {
         let text = std::fs::read_to_string(path).map_err(|error| error.to_string());
-        let access = text.and_then(|text| Self::parse(&text));
-        access.map_err(|problem| Failure::usage(format!("{}: {problem}", path.display())))
+        let identities = text.and_then(|text| Self::parse(&text));
+        identities.map_err(|problem| Failure::usage(format!("--identities {}: {problem}", path.display())))
     }
 
     fn parse(text: &str) -> Result<Self, String> {
@@ -102,45 +186,7 @@ impl Access {
                 return Err(format!("{place}: the same SHA-256 occurs before"));
             }
         }
-        Ok(Self { known: Some(known), certificates })
-    }
-
-    /// Callers must authenticate.
-    pub fn restricted(&self) -> bool {
-        self.known.is_some()
-    }
-
-    /// Authenticates a call by its `authorization` header, or else by its client certificate.
-    /// Missing or unknown credentials are UNAUTHENTICATED.
-    pub fn authenticate<T>(&self, request: &http::Request<T>) -> Result<Caller, Status> {
-        let tls = request.extensions().get::<TlsConnectInfo<TcpConnectInfo>>();
-        let certificate = tls
-            .and_then(TlsConnectInfo::peer_certs)
-            .and_then(|chain| chain.first().map(|leaf| sha256_hex(leaf.as_ref())));
-        let Some(known) = &self.known else {
-            let name = match (&certificate, peer_address(request.extensions())) {
-                (Some(hash), _) => format!("certificate-{}", &hash[..16]),
-                (None, Some(address)) => address.ip().to_string(),
-                (None, None) => "local".to_owned(),
-            };
-            return Ok(Caller { name: name.into(), role: Role::Admin });
-        };
-        if let Some(value) = request.headers().get("authorization") {
-            // Only digests are compared, so the duration reveals nothing about a token.
-            let token = value.to_str().ok().and_then(|text| text.strip_prefix("Bearer "));
-            let caller = token.and_then(|token| known.get(&sha256_hex(token.trim().as_bytes())));
-            return caller.cloned().ok_or_else(|| {
-                Status::unauthenticated(
-                    "authorization: unknown bearer token; check the token, or add its SHA-256 to --identities",
-                )
-            });
-        }
-        let caller = certificate.and_then(|hash| known.get(&hash));
-        caller.cloned().ok_or_else(|| {
-            Status::unauthenticated(
-                "authorization: missing; send 'authorization: Bearer TOKEN', or connect with a client certificate listed in --identities",
-            )
-        })
+        Ok(Self { known, certificates })
     }
 }
 
@@ -157,14 +203,12 @@ pub fn caller<T>(request: &Request<T>, allowed: &[Role]) -> Result<Caller, Statu
 }
 
 /// The address that a call comes from; `None` in process.
-pub(super) fn peer_address(extensions: &http::Extensions) -> Option<SocketAddr> {
-    let plain = extensions.get::<TcpConnectInfo>();
-    let info = plain.or_else(|| extensions.get::<TlsConnectInfo<TcpConnectInfo>>().map(TlsConnectInfo::get_ref));
-    info.and_then(TcpConnectInfo::remote_addr)
+pub fn peer_address(extensions: &http::Extensions) -> Option<SocketAddr> {
+    extensions.get::<Peer>().map(|peer| peer.address)
 }
 
 /// SHA-256 as lower-case hex.
-fn sha256_hex(bytes: &[u8]) -> String {
+pub(super) fn sha256_hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
@@ -176,7 +220,7 @@ mod tests {
     fn tokens_authenticate_by_their_hash() {
         let hash = sha256_hex(b"secret");
         let text = format!("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = '{}'", hash.to_uppercase());
-        let access = Access::parse(&text).unwrap();
+        let access = Access { path: Some(Path::new("x").into()), live: Live::new(Identities::parse(&text).unwrap()) };
         let ask = |value: Option<&str>| {
             let mut request = http::Request::new(());
             if let Some(value) = value {
@@ -215,7 +259,7 @@ mod tests {
             ("[[identity]]\nname = ''\nrole = 'client'\ntoken_sha256 = 'abc'", "identity[0].name"),
             ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken = 'abc'", "unknown field"),
         ] {
-            let error = Access::parse(text).unwrap_err();
+            let error = Identities::parse(text).unwrap_err();
             assert!(error.contains(words), "{error}");
         }
     }

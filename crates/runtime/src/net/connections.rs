@@ -21,7 +21,6 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Sleep;
 use tokio_stream::Stream;
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
-use tonic::transport::server::{Connected, TcpConnectInfo};
 
 /// Files that a process needs besides its connections; half of them if there are few, but not less than it cannot do without.
 const OTHER_FILES: usize = 128;
@@ -200,11 +199,10 @@ pub struct Connection {
     slot: Slot,
 }
 
-impl Connected for Connection {
-    type ConnectInfo = TcpConnectInfo;
-
-    fn connect_info(&self) -> TcpConnectInfo {
-        self.stream.connect_info()
+impl Connection {
+    /// The peer's address.
+    pub(crate) fn address(&self) -> SocketAddr {
+        self.slot.address
     }
 }
 
@@ -277,7 +275,7 @@ impl axum::serve::Listener for Incoming {
         loop {
             // The stream below never ends and never fails.
             if let Some(Ok(connection)) = std::future::poll_fn(|cx| Pin::new(&mut *self).poll_next(cx)).await {
-                let address = connection.slot.address;
+                let address = connection.address();
                 return (connection, address);
             }
         }

@@ -5,6 +5,7 @@ mod truncate_status;
 
 use crate::net::auth::{Access, Caller, Role, peer_address};
 use crate::net::call_metrics::Calls;
+use crate::net::compression::{Encoding, Inflating, PREFIX};
 use crate::net::connections::Connections;
 use crate::net::deadline::{self, Deadline};
 use crate::net::in_flight::{CallKind, InFlight, Permit};
@@ -19,15 +20,12 @@ use std::time::{Duration, Instant};
 use tokio::time::Sleep;
 use tonic::Status;
 use tonic::body::Body;
-use tonic::codegen::{Service, http};
+use tonic::codegen::{Bytes, Service, http};
 use tonic::server::NamedService;
 use truncate_status::truncate_status;
 
 /// Timeout of a message of a stream, from its first byte to its last, and of the whole request of a unary call.
 const MESSAGE: Duration = Duration::from_secs(30);
-
-/// Bytes before every message: a compression flag and the length.
-const PREFIX: usize = 5;
 
 /// Longest message to a public service, bytes: the name of a service or of a symbol.
 const ANONYMOUS_MESSAGE: usize = 4096;
@@ -105,9 +103,10 @@ impl<S> Guard<S> {
         if let Some(deadline) = Deadline::of(request.headers()) {
             request.extensions_mut().insert(deadline);
         }
+        let encoding = Encoding::of_request(request.headers_mut())?;
         let permit = Arc::new(permit);
         let metered = permit.clone();
-        Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, limit))), permit))
+        Ok((request.map(|body| Body::new(Metered::new(body, metered, kind, limit, encoding))), permit))
     }
 }
 
@@ -136,13 +135,14 @@ where
             Policy::Public => None,
         };
         let counted = calls.map(|calls| (calls.method(request.uri().path()), calls, Instant::now()));
+        let accepted = Encoding::for_response(request.headers());
         let admitted = self.admit(request).map(|(request, permit)| {
             let deadline = request.extensions().get().copied();
             (deadline::within(deadline, self.service.call(request)), permit)
         });
         Box::pin(async move {
             let response = match admitted {
-                Ok((answer, permit)) => finish(answer.await?, permit),
+                Ok((answer, permit)) => finish(answer.await?, permit, accepted),
                 Err(status) => status.into_http(),
             };
             if let Some((method, calls, start)) = counted {
@@ -153,16 +153,20 @@ where
     }
 }
 
-/// Cuts the texts of statuses, and holds the permit until the last frame is sent.
-fn finish(mut response: http::Response<Body>, permit: Arc<Permit>) -> http::Response<Body> {
+/// Cuts the texts of statuses, compresses messages if the caller accepts that, and holds the permit until the last frame is sent.
+fn finish(mut response: http::Response<Body>, permit: Arc<Permit>, encoding: Option<Encoding>) -> http::Response<Body> {
     truncate_status(response.headers_mut());
+    Encoding::announce(encoding, response.headers_mut());
     response.map(|body| {
         Body::new(body.map_frame(move |mut frame| {
             let _held = &permit;
             if let Some(trailers) = frame.trailers_mut() {
                 truncate_status(trailers);
             }
-            frame
+            match encoding {
+                Some(encoding) => frame.map_data(|data| encoding.compress(data)),
+                None => frame,
+            }
         }))
     })
 }
@@ -186,6 +190,10 @@ struct Metered {
     permit: Arc<Permit>,
     limit: Limit,
     kind: CallKind,
+    /// The compression of messages whose flag is set.
+    encoding: Option<Encoding>,
+    /// The compressed message that arrives.
+    inflating: Option<Inflating>,
     prefix: [u8; PREFIX],
     /// Bytes of the prefix that have arrived, and bytes of the message that have not.
     known: usize,
@@ -196,31 +204,47 @@ struct Metered {
 }
 
 impl Metered {
-    fn new(body: Body, permit: Arc<Permit>, kind: CallKind, limit: Limit) -> Self {
+    fn new(body: Body, permit: Arc<Permit>, kind: CallKind, limit: Limit, encoding: Option<Encoding>) -> Self {
         // A stream may be silent before and between messages.
         let timed = kind == CallKind::Call;
-        Self { body, permit, limit, kind, prefix: [0; PREFIX], known: 0, rest: 0, timed, timeout: None }
+        let (inflating, prefix) = (None, [0; PREFIX]);
+        Self { body, permit, limit, kind, encoding, inflating, prefix, known: 0, rest: 0, timed, timeout: None }
     }
 
-    fn count(&mut self, mut data: &[u8]) -> Result<(), Status> {
+    /// Counts the messages in these bytes. Returns them as the service gets them, if that is otherwise than as they came.
+    fn count(&mut self, mut data: &[u8]) -> Result<Option<Bytes>, Status> {
+        // Nothing is copied unless messages may be compressed.
+        let mut plain = self.encoding.map(|_| Vec::new());
         while !data.is_empty() {
             if self.rest > 0 {
                 let step = self.rest.min(data.len());
-                (self.rest, data) = (self.rest - step, &data[step..]);
+                let arrived;
+                (arrived, data) = data.split_at(step);
+                self.rest -= step;
+                if let Some(inflating) = &mut self.inflating {
+                    self.permit.reserve(inflating.push(arrived)?)?;
+                } else if let Some(plain) = &mut plain {
+                    plain.extend_from_slice(arrived);
+                }
                 if self.rest == 0 {
                     // The next message has its own timeout.
                     self.timeout = None;
+                    self.unpack(&mut plain)?;
                 }
             } else {
                 let step = (PREFIX - self.known).min(data.len());
                 self.prefix[self.known..self.known + step].copy_from_slice(&data[..step]);
                 (self.known, data) = (self.known + step, &data[step..]);
                 if self.known == PREFIX {
-                    let [_, a, b, c, d] = self.prefix;
+                    let [flag, a, b, c, d] = self.prefix;
                     (self.known, self.rest) = (0, u32::from_be_bytes([a, b, c, d]) as usize);
+                    self.inflating = self.encoding.filter(|_| flag == 1).map(|e| Inflating::new(e, self.limit.bytes));
+                    if let Some(plain) = plain.as_mut().filter(|_| self.inflating.is_none()) {
+                        plain.extend_from_slice(&self.prefix);
+                    }
                     if self.rest <= self.limit.bytes {
                         self.permit.reserve(self.rest)?;
-                    } else if self.limit.strict {
+                    } else if self.limit.strict || self.inflating.is_some() {
                         let (length, limit) = (self.rest, self.limit.bytes);
                         return Err(Status::out_of_range(format!(
                             "message of {length} bytes exceeds the limit of {limit}"
@@ -228,6 +252,7 @@ impl Metered {
                     }
                     if self.rest == 0 {
                         self.timeout = None;
+                        self.unpack(&mut plain)?;
                     }
                 }
             }
@@ -236,22 +261,34 @@ impl Metered {
         if !self.timed {
             self.timeout = None;
         }
+        Ok(plain.map(Bytes::from))
+    }
+
+    /// Appends a compressed message that has arrived.
+    fn unpack(&mut self, plain: &mut Option<Vec<u8>>) -> Result<(), Status> {
+        if let (Some(inflating), Some(plain)) = (self.inflating.take(), plain) {
+            let message = inflating.finish()?;
+            self.permit.reserve(message.len())?;
+            plain.extend_from_slice(&message);
+        }
         Ok(())
     }
 }
 
 impl http_body::Body for Metered {
-    type Data = tonic::codegen::Bytes;
+    type Data = Bytes;
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
-        let next = Pin::new(&mut self.body).poll_frame(cx);
-        match &next {
+        let mut next = Pin::new(&mut self.body).poll_frame(cx);
+        match &mut next {
             Poll::Ready(Some(Ok(frame))) => {
-                if let Some(data) = frame.data_ref()
-                    && let Err(status) = self.count(data)
-                {
-                    return Poll::Ready(Some(Err(status)));
+                if let Some(data) = frame.data_mut() {
+                    match self.count(data) {
+                        Ok(Some(plain)) => *data = plain,
+                        Ok(None) => {}
+                        Err(status) => return Poll::Ready(Some(Err(status))),
+                    }
                 }
             }
             Poll::Pending if self.timed => {

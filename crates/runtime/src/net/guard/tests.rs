@@ -22,7 +22,7 @@ fn metered(kind: CallKind, strict: bool) -> (mpsc::UnboundedSender<Bytes>, Meter
     let in_flight = InFlight::new(limits, CancellationToken::new());
     let permit = in_flight.acquire(&Caller { name: "a".into(), role: Role::Client }, kind).unwrap();
     let (chunks, receiver) = mpsc::unbounded_channel();
-    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(permit), kind, Limit { bytes: 100, strict }))
+    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(permit), kind, Limit { bytes: 100, strict }, None))
 }
 
 async fn next(body: &mut Metered) -> Option<Result<Frame<Bytes>, Status>> {
@@ -111,4 +111,43 @@ async fn anonymous_callers_hold_a_bounded_number_of_calls() {
     // Unary calls have a limit of their own.
     let mut other = public.call(http::Request::builder().uri("/s/Check").body(Body::empty()).unwrap());
     assert!(std::future::poll_fn(|cx| Poll::Ready(other.as_mut().poll(cx))).await.is_pending());
+}
+
+#[tokio::test]
+async fn of_a_compressed_message_the_length_that_comes_out_counts() {
+    use std::io::Write as _;
+    let packed = |length: usize| {
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+        encoder.write_all(&vec![0; length]).unwrap();
+        let bytes = encoder.finish().unwrap();
+        Bytes::from([&[1][..], &(bytes.len() as u32).to_be_bytes(), &bytes].concat())
+    };
+    for (limit, length, code) in [
+        (100, 100, None),
+        (100, 101, Some(tonic::Code::OutOfRange)),
+        // Within the limit of a message, and beyond that of the caller.
+        (4 << 20, 2 << 20, Some(tonic::Code::ResourceExhausted)),
+    ] {
+        let (chunks, mut body) = metered(CallKind::Call, false);
+        (body.encoding, body.limit.bytes) = (Some(Encoding::Gzip), limit);
+        for chunk in packed(length).chunks(11) {
+            chunks.send(Bytes::copy_from_slice(chunk)).unwrap();
+        }
+        drop(chunks);
+        let (mut plain, mut refused) = (Vec::new(), None);
+        while let Some(frame) = next(&mut body).await {
+            match frame {
+                Ok(frame) => plain.extend_from_slice(frame.data_ref().unwrap()),
+                Err(status) => {
+                    refused = Some(status.code());
+                    break;
+                }
+            }
+        }
+        assert_eq!(refused, code, "{length} of {limit}");
+        assert!(
+            code.is_some()
+                || plain == message(length as u8).iter().map(|b| if *b == 7 { 0 } else { *b }).collect::<Vec<_>>()
+        );
+    }
 }
