@@ -6,7 +6,7 @@ use std::path::Path;
 
 /// The processes.
 pub(crate) struct Fleet {
-    learner: Service,
+    learner: Service<'static>,
     running: Running,
     /// Commander and actors, with their names.
     pub(crate) others: Vec<(String, Running)>,

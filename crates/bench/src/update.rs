@@ -81,8 +81,8 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
     // One episode is one minibatch.
     config.task.horizon = (units * chunk) as u32;
     let trajectory = synthetic(&config, minibatches);
-    let pool =
-        rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(64 << 20).build().map_err(TrainError::Threads)?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(64 << 20).build();
+    let pool = pool.map_err(|error| TrainError::Threads(error.to_string()))?;
     pool.install(|| {
         let mut time = [Vec::new(), Vec::new()];
         for round in 0..=rounds {
