@@ -244,6 +244,12 @@ impl Metric {
     }
 }
 
+/// A mean of single-precision numbers as the shortest decimal number that is the same in single precision: 0.69 in place of
+/// 0.6900000135600567. What a mean has beyond that is rounding.
+pub fn as_written(mean: f64) -> f64 {
+    (mean as f32).to_string().parse().unwrap_or(mean)
+}
+
 /// A share between 0 and 1: four decimals, and never rounded up to 1.
 pub fn share(value: f64) -> String {
     if value < 1.0 { format!("{:.4}", value.min(0.9999)) } else { format!("{value:.4}") }

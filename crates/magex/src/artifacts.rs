@@ -53,11 +53,19 @@ pub(crate) fn run_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
 }
 
-/// Writes a file atomically: to a temporary file that is then renamed.
+/// Writes a file atomically, to a temporary file that is then renamed, and makes its folder.
 pub(crate) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let mut temporary = path.as_os_str().to_owned();
     temporary.push(".tmp");
-    std::fs::write(&temporary, bytes)
-        .and_then(|()| std::fs::rename(&temporary, path))
-        .map_err(|error| cannot_create(format!("{}: {error}", path.display())))
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    std::fs::create_dir_all(folder).map_err(|error| cannot_create(format!("{}: {error}", folder.display())))?;
+    if path.is_dir() {
+        return Err(cannot_create(format!("{}: is a folder; give a file", path.display())));
+    }
+    let written = std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, path));
+    written.map_err(|error| {
+        // Half a file would look like a page.
+        let _ = std::fs::remove_file(&temporary);
+        cannot_create(format!("{}: {error}", path.display()))
+    })
 }

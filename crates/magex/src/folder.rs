@@ -31,13 +31,29 @@ pub(crate) fn default_out(config: &RunConfig, exists: impl Fn(&Path) -> bool) ->
     unused(&format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed), exists)
 }
 
+/// The folder of all runs, unless an option says otherwise.
+pub(crate) const RUNS: &str = "runs";
+
+/// Parses the name of a run folder within [`RUNS`].
+pub(crate) fn name(text: &str) -> Result<String, String> {
+    let plain = Path::new(text).file_name().is_some_and(|name| name == text);
+    if plain { Ok(text.to_owned()) } else { Err(format!("'{text}' is no name of a folder; --out takes a path")) }
+}
+
+/// The run in [`RUNS`] that was written to last.
+pub(crate) fn newest() -> Option<PathBuf> {
+    let folders = std::fs::read_dir(RUNS).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let runs = folders.filter(|folder| folder.join(CONFIG).is_file());
+    runs.max_by_key(|folder| std::fs::metadata(folder.join("metrics.jsonl")).and_then(|file| file.modified()).ok())
+}
+
 /// `runs/<name>`, or the same with -2, -3, … if it exists.
 pub(crate) fn unused(name: &str, exists: impl Fn(&Path) -> bool) -> PathBuf {
-    let first = Path::new("runs").join(name);
+    let first = Path::new(RUNS).join(name);
     if !exists(&first) {
         return first;
     }
-    (2u32..).map(|k| Path::new("runs").join(format!("{name}-{k}"))).find(|path| !exists(path)).unwrap_or(first)
+    (2u32..).map(|k| Path::new(RUNS).join(format!("{name}-{k}"))).find(|path| !exists(path)).unwrap_or(first)
 }
 
 /// Creates the folder of a new run with its configuration. A folder that is not empty is rejected.

@@ -25,3 +25,4 @@ mod parallel;
 mod parent_watch;
 mod progress;
 mod synthetic;
+mod usage;

@@ -33,9 +33,8 @@ impl Token {
 
     /// Reads a token from a file.
     pub fn read(path: &Path) -> Result<Self, Failure> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Failure::usage(format!("the token's file {}: {error}", path.display())))?;
-        Self::new(&text, &path.display().to_string())
+        let text = crate::options::text_file("--token-file", path)?;
+        Self::new(&text, &format!("--token-file {}", path.display()))
     }
 }
 

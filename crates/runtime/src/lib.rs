@@ -8,6 +8,7 @@ pub mod health;
 pub mod http;
 pub mod metrics;
 pub mod net;
+pub mod options;
 pub mod process;
 pub mod security;
 pub mod server;

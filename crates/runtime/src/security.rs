@@ -4,6 +4,7 @@ use crate::client::{Settings, Token};
 use crate::exit::Failure;
 use crate::net::auth::Access;
 use crate::net::connections::ConnectionLimits;
+use crate::options;
 use crate::server;
 use crate::tls::{ClientTls, ServerTls};
 use clap::Args;
@@ -35,13 +36,13 @@ pub struct ServerArgs {
     #[arg(long, env = "MAGEX_IDENTITIES", value_name = "FILE", help_heading = "Security")]
     pub identities: Option<PathBuf>,
     /// Allow a non-loopback address without TLS or without authentication, and allow sending a token without TLS
-    #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
+    #[arg(long, env = "MAGEX_INSECURE", value_parser = options::switch, help_heading = "Security")]
     pub insecure: bool,
     /// Maximum number of connections
-    #[arg(long, default_value_t = 2048, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 2048, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub max_connections: u32,
     /// Maximum number of connections from one IP address
-    #[arg(long, default_value_t = 1024, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 1024, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub connections_per_peer: u32,
 }
 
@@ -130,7 +131,7 @@ pub struct CallerArgs {
     #[arg(long, env = "MAGEX_TLS_KEY", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub tls_key: Option<PathBuf>,
     /// Allow sending the token without TLS to other machines
-    #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
+    #[arg(long, env = "MAGEX_INSECURE", value_parser = options::switch, help_heading = "Security")]
     pub insecure: bool,
 }
 
