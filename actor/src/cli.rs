@@ -81,10 +81,13 @@ fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
         let named = |error| Failure::usage(format!("--config {}: {error}", path.display()));
         Ok(config.map_err(named)?.task.fingerprint())
     };
+    let client = args.security.read()?;
+    client.check("--learner", &args.learner)?;
+    client.check("--commander", &args.commander)?;
     Ok(ActorConfig {
         learner_url: args.learner.clone(),
         commander_url: args.commander.clone(),
-        client: args.security.read()?,
+        client,
         actor_id: args.name.clone(),
         threads: args.threads,
         expected_task: args.config.as_ref().map(fingerprint).transpose()?,

@@ -86,6 +86,7 @@ impl CommanderArgs {
         let weights = self.weights.as_ref().map(find).transpose()?;
         let security = self.security.read(&self.listen)?;
         let client = self.client.read(self.security.own(), self.security.insecure)?;
+        self.learner.as_deref().map_or(Ok(()), |url| client.check("--learner", url))?;
         let each = MissionLimits {
             members: self.mission_agents as usize,
             lifetime_ms: i64::from(self.mission_hours) * 3_600_000,

@@ -52,10 +52,15 @@ enum Command {
     Commander(roles::CommanderRole),
 }
 
+/// The commands and their options.
+pub fn definition() -> clap::Command {
+    taking_negative_numbers(Cli::command())
+}
+
 /// Parses the arguments, runs the command, and reports the result.
 pub fn main() -> ExitCode {
     let arguments = roles::by_name(std::env::args_os());
-    let mut command = taking_negative_numbers(Cli::command());
+    let mut command = definition();
     let parsed = command.try_get_matches_from_mut(&arguments).and_then(|matches| Cli::from_arg_matches(&matches));
     let cli = match parsed {
         Ok(cli) => cli,

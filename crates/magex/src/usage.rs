@@ -16,7 +16,7 @@ const SIMILAR: f64 = 0.8;
 /// Every option that takes a value takes negative numbers, too: the refusal then names the range.
 pub(crate) fn taking_negative_numbers(command: Command) -> Command {
     let negative = |arg: Arg| if arg.get_action().takes_values() { arg.allow_negative_numbers(true) } else { arg };
-    command.mut_subcommands(move |sub| sub.mut_args(negative))
+    command.mut_args(negative).mut_subcommands(move |sub| sub.mut_args(negative))
 }
 
 /// The options whose values come from variables of the environment.
@@ -135,9 +135,6 @@ fn explain(error: &clap::Error) -> String {
 
 /// A name that differs in little from the one that was written; similar words that mean something else would mislead.
 fn suggestion(written: &str, similar: &str) -> String {
-    let similar = similar.split(", ").next().unwrap_or_default();
-    match strsim::normalized_damerau_levenshtein(written, similar) >= SIMILAR {
-        true => format!("; is {similar} meant?"),
-        false => String::new(),
-    }
+    let close = |name: &&str| strsim::normalized_damerau_levenshtein(written, name) >= SIMILAR;
+    similar.split(", ").find(close).map_or_else(String::new, |name| format!("; is {name} meant?"))
 }

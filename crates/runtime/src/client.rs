@@ -65,6 +65,15 @@ impl Settings {
         })
     }
 
+    /// Whether calls could be made to the address that an option gave; nothing is connected.
+    ///
+    /// # Errors
+    /// Wrong usage; the error names the option.
+    pub fn check(&self, option: &str, url: &str) -> Result<(), Failure> {
+        let checked = self.endpoint(url);
+        checked.map(drop).map_err(|error| Failure::new(error.code, format!("{option}: {error}")))
+    }
+
     fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), Failure> {
         let endpoint = endpoint_with(url, self.tls.as_ref())?;
         let encrypted = endpoint.uri().scheme_str() == Some("https");

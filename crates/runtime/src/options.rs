@@ -105,6 +105,18 @@ pub fn text_file(option: &str, path: &Path) -> Result<String, Failure> {
     String::from_utf8(bytes).map_err(|_| wrong("is not a text file (UTF-8)"))
 }
 
+/// Where a TOML text is wrong and how, in plain words.
+pub(crate) fn toml_problem(text: &str, error: &toml::de::Error) -> String {
+    let message = error.message().trim().replace('`', "'").replace("expected one of", "use one of");
+    let problem = match message.strip_prefix("missing field ") {
+        Some(key) => format!("{key} is missing"),
+        None if message.starts_with("invalid type") => "a value of another kind belongs here".to_owned(),
+        None => message.replace("unknown field", "unknown key").replace("unknown variant", "unknown name"),
+    };
+    let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+    format!("line {}: {problem}", before.matches('\n').count() + 1)
+}
+
 /// Why a file could not be read.
 pub fn unreadable(error: &std::io::Error) -> String {
     match error.kind() {

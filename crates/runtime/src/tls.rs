@@ -15,9 +15,9 @@ pub struct ServerTls {
 impl ServerTls {
     /// Reads the server's certificate chain and key; with `client_ca`, every client must present a certificate of that CA.
     pub fn read(certificate: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Self, Failure> {
-        let config = ServerTlsConfig::new().identity(Identity::from_pem(read(certificate)?, read(key)?));
+        let config = ServerTlsConfig::new().identity(Identity::from_pem(read("--tls-cert", certificate)?, read("--tls-key", key)?));
         let config = match client_ca {
-            Some(ca) => config.client_ca_root(Certificate::from_pem(read(ca)?)),
+            Some(ca) => config.client_ca_root(Certificate::from_pem(read("--client-ca", ca)?)),
             None => config,
         };
         Ok(Self { config, mutual: client_ca.is_some() })
@@ -38,10 +38,10 @@ impl std::fmt::Debug for ClientTls {
 impl ClientTls {
     /// Reads the CA of the server's certificate, and the client's certificate and key.
     pub fn read(ca: &Path, certificate: Option<&Path>, key: Option<&Path>) -> Result<Self, Failure> {
-        let config = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read(ca)?));
+        let config = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read("--tls-ca", ca)?));
         match (certificate, key) {
             (Some(certificate), Some(key)) => {
-                Ok(Self(config.identity(Identity::from_pem(read(certificate)?, read(key)?))))
+                Ok(Self(config.identity(Identity::from_pem(read("--tls-cert", certificate)?, read("--tls-key", key)?))))
             }
             (None, None) => Ok(Self(config)),
             _ => Err(Failure::usage("the client's certificate and its key belong together: give both or none")),
@@ -62,6 +62,10 @@ pub(crate) fn unusable(problem: impl std::fmt::Display) -> Failure {
     Failure::usage(format!("the certificates are unusable: {problem}"))
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Failure> {
-    std::fs::read(path).map_err(|error| Failure::usage(format!("{}: {error}", path.display())))
+fn read(option: &str, path: &Path) -> Result<String, Failure> {
+    let text = crate::options::text_file(option, path)?;
+    if !text.contains("-----BEGIN") {
+        return Err(Failure::usage(format!("{option} {}: is not a PEM file", path.display())));
+    }
+    Ok(text)
 }
