@@ -24,6 +24,8 @@ const CONFIG: &str = "config.toml";
 pub struct WeightsFile {
     weights: PathBuf,
     config: PathBuf,
+    /// The option that names it, unless it is beside the weights.
+    option: &'static str,
     name: String,
 }
 
@@ -55,6 +57,7 @@ impl WeightsFile {
         } else {
             (path.to_owned(), path.with_file_name(CONFIG))
         };
+        let option = if config.is_some() { "--config" } else { "" };
         let config = config.map_or(beside, Path::to_owned);
         if path.is_file() && !looks_like_weights(path) {
             return Err(unusable(path, "not a weights file (safetensors); give the folder of a finished run, or its weights file"));
@@ -65,7 +68,7 @@ impl WeightsFile {
         if !config.is_file() {
             return Err(unusable(&config, "no such file; give the run's configuration with --config"));
         }
-        Ok(Self { weights, config, name })
+        Ok(Self { weights, config, option, name })
     }
 
     /// Reads both files and loads the model, on a thread that may block. Returns their hashes, too, to detect a change of content.
@@ -77,7 +80,7 @@ impl WeightsFile {
 
     fn load_here(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), Failure> {
         let bytes = std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, options::unreadable(&error)))?;
-        let toml = options::text_file("", &self.config)?;
+        let toml = options::text_file(self.option, &self.config)?;
         let scheduler = load_scheduler(&bytes, &toml).map_err(|error| unusable(&self.weights, error))?;
         let (run_id, sha256) = (RunId(self.name.clone()), sha256_hex(&bytes));
         let content = [sha256.clone(), sha256_hex(toml.as_bytes())];

@@ -30,7 +30,7 @@ pub fn coded(code: u8, message: impl fmt::Display) -> anyhow::Error {
 }
 
 /// The exit code of a command; reports its error.
-pub(crate) fn exit_code(result: anyhow::Result<u8>, options: &CommonOptions, variables: &FromEnvironment) -> ExitCode {
+pub fn exit_code(result: anyhow::Result<u8>, options: &CommonOptions, variables: &FromEnvironment) -> ExitCode {
     ExitCode::from(result.unwrap_or_else(|error| {
         let code = code_of(&error);
         fatal(&variables.named(&format!("{error:#}")), code, options.json);

@@ -111,7 +111,7 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
             return Err(usage(format!("{} is a file: add --config with the run's config.toml", path.display())));
         };
         let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
-        let config = crate::settings::read(Some(config))?;
+        let config = crate::settings::read_from("--config", config)?;
         let (sha256, name) = (sha256::hex(&weights), path.display().to_string());
         return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new() });
     }

@@ -58,9 +58,13 @@ impl Overrides {
 
 /// Reads a configuration file; without one, the defaults.
 pub fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
-    let Some(path) = path else { return Ok(RunConfig::default()) };
-    let text = options::text_file("", path)?;
-    RunConfig::from_toml(&text).with_context(|| path.display().to_string())
+    path.map_or_else(|| Ok(RunConfig::default()), |path| read_from("", path))
+}
+
+/// Reads the configuration file that an option names.
+pub(crate) fn read_from(option: &str, path: &Path) -> anyhow::Result<RunConfig> {
+    let text = options::text_file(option, path)?;
+    RunConfig::from_toml(&text).with_context(|| format!("{option} {}", path.display()).trim_start().to_owned())
 }
 
 /// Parses a name of the configuration, such as an executor.

@@ -14,18 +14,18 @@ use std::process::ExitCode;
 const SIMILAR: f64 = 0.8;
 
 /// Every option that takes a value takes negative numbers, too: the refusal then names the range.
-pub(crate) fn taking_negative_numbers(command: Command) -> Command {
+pub fn taking_negative_numbers(command: Command) -> Command {
     let negative = |arg: Arg| if arg.get_action().takes_values() { arg.allow_negative_numbers(true) } else { arg };
     command.mut_args(negative).mut_subcommands(move |sub| sub.mut_args(negative))
 }
 
 /// The options whose values come from variables of the environment.
 #[derive(Debug, Default)]
-pub(crate) struct FromEnvironment(Vec<(String, String)>);
+pub struct FromEnvironment(Vec<(String, String)>);
 
 impl FromEnvironment {
     /// Those of the subcommand that `arguments` call.
-    pub(crate) fn of(command: &Command, arguments: &[OsString]) -> Self {
+    pub fn of(command: &Command, arguments: &[OsString]) -> Self {
         let called = arguments.iter().skip(1).find_map(|argument| command.find_subcommand(argument));
         let set = |arg: &Arg| {
             let (variable, option) = (arg.get_env()?, format!("--{}", arg.get_long()?));
@@ -40,7 +40,7 @@ impl FromEnvironment {
     }
 
     /// A message in which these options have the names of their variables.
-    pub(crate) fn named(&self, message: &str) -> String {
+    pub fn named(&self, message: &str) -> String {
         let part = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
         self.0.iter().fold(message.to_owned(), |text, (option, variable)| {
             let mut out = String::new();
@@ -58,7 +58,7 @@ impl FromEnvironment {
 }
 
 /// Reports an error of the command line parser; help and version count as success.
-pub(crate) fn report(command: &Command, arguments: &[OsString], error: &clap::Error) -> ExitCode {
+pub fn report(command: &Command, arguments: &[OsString], error: &clap::Error) -> ExitCode {
     if !error.use_stderr() {
         // If printing fails there is no other place to report it.
         let _ = error.print();
@@ -77,7 +77,8 @@ pub(crate) fn report(command: &Command, arguments: &[OsString], error: &clap::Er
         text += &format!("; the environment sets {}", names.join(", "));
     }
     let called = arguments.iter().skip(1).find_map(|argument| Some(command.find_subcommand(argument)?.get_name()));
-    let help = called.map_or_else(|| "magex --help".to_owned(), |name| format!("magex {name} --help"));
+    let program = command.get_name();
+    let help = called.map_or_else(|| format!("{program} --help"), |name| format!("{program} {name} --help"));
     fatal(&format!("{text} (more: {help})"), exit::USAGE, arguments.iter().any(|argument| argument == "--json"));
     ExitCode::from(exit::USAGE)
 }
