@@ -60,7 +60,10 @@ impl WeightsFile {
         let option = if config.is_some() { "--config" } else { "" };
         let config = config.map_or(beside, Path::to_owned);
         if path.is_file() && !looks_like_weights(path) {
-            return Err(unusable(path, "not a weights file (safetensors); give the folder of a finished run, or its weights file"));
+            return Err(unusable(
+                path,
+                "not a weights file (safetensors); give the folder of a finished run, or its weights file",
+            ));
         }
         if !weights.is_file() {
             return Err(unusable(&weights, "no such file; give the folder of a finished run, or its weights file"));
@@ -79,7 +82,8 @@ impl WeightsFile {
     }
 
     fn load_here(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), Failure> {
-        let bytes = std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, options::unreadable(&error)))?;
+        let bytes =
+            std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, options::unreadable(&error)))?;
         let toml = options::text_file(self.option, &self.config)?;
         let scheduler = load_scheduler(&bytes, &toml).map_err(|error| unusable(&self.weights, error))?;
         let (run_id, sha256) = (RunId(self.name.clone()), sha256_hex(&bytes));

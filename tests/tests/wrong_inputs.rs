@@ -133,7 +133,11 @@ fn options() -> Vec<Row> {
             }
             let choices = !argument.get_possible_values().is_empty();
             // Only a weights file takes a configuration.
-            let base = if long == "config" { base(name).replace("{f}/run", "{f}/noise") } else { without(base(name), &option) };
+            let base = if long == "config" {
+                base(name).replace("{f}/run", "{f}/noise")
+            } else {
+                without(base(name), &option)
+            };
             for value in wrong_values(long, kind, choices) {
                 let mut wrong = row(&format!("{base}{}", companion(name, long)), 64, &[&option]);
                 wrong.arguments.extend([option.clone(), (*value).to_owned()]);
@@ -183,7 +187,11 @@ fn keys(folder: &Path) -> Vec<Row> {
             set(&mut table, &format!("{section}.no_{last}"), Value::Integer(1));
             let file = folder.join(format!("{name}-{key}-unknown.toml"));
             std::fs::write(&file, table.to_string()).unwrap();
-            rows.push(row(&format!("train {} --print-config", file.display()), 64, &[&format!("{section}.no_{last}"), "use"]));
+            rows.push(row(
+                &format!("train {} --print-config", file.display()),
+                64,
+                &[&format!("{section}.no_{last}"), "use"],
+            ));
         }
     }
     rows
@@ -212,7 +220,9 @@ fn wrong_for(value: &Value) -> Vec<Value> {
     let text = || Value::String("five".to_owned());
     let list = || Value::Array(vec![Value::Integer(1)]);
     match value {
-        Value::Integer(_) => vec![text(), list(), Value::Boolean(true), (-1).into(), 1.5.into(), 1e300.into(), i64::MAX.into()],
+        Value::Integer(_) => {
+            vec![text(), list(), Value::Boolean(true), (-1).into(), 1.5.into(), 1e300.into(), i64::MAX.into()]
+        }
         Value::Float(_) => vec![text(), list(), Value::Boolean(true), (-1).into(), f64::NAN.into(), 1e300.into()],
         Value::Boolean(_) => vec![text(), list(), 1.into(), 0.5.into()],
         _ => vec![text(), list(), 1.into(), Value::Boolean(true)],
@@ -227,6 +237,7 @@ fn by_hand() -> Vec<Row> {
         ("train {f}/folder", 64, &["{f}/folder", "is a folder"]),
         ("train {f}/noise", 64, &["{f}/noise", "not a text file"]),
         ("train {f}/noise/below", 64, &["{f}/noise/below", "is a file"]),
+        ("train {f}/ring.toml", 64, &["task.spawn", "'ring'", "use uniform"]),
         ("train {f}/agents-only.toml", 64, &["task.name", "simple-spread"]),
         ("train {f}/open-table.toml", 64, &["open-table.toml", "line 2"]),
         ("train {f}/no-section.toml", 64, &["run", "[section]"]),
@@ -346,7 +357,11 @@ fn by_hand() -> Vec<Row> {
         with("MAGEX_TLS_CA", "{f}/none", row("health https://127.0.0.1:9", 64, &["{f}/none"])),
         with("MAGEX_RESUME", "true", row("learner --resume-or-create", 64, &["MAGEX_RESUME", "--resume-or-create"])),
         with("MAGEX_LOG_FORMAT", "json", row("train --agents five", 64, &["\"exit_code\":64", "--agents"])),
-        with("MAGEX_LOG_FORMAT", "json", row("assign --random 2 --connect http://127.0.0.1:9", 69, &["\"level\":\"ERROR\""])),
+        with(
+            "MAGEX_LOG_FORMAT",
+            "json",
+            row("assign --random 2 --connect http://127.0.0.1:9", 69, &["\"level\":\"ERROR\""]),
+        ),
     ]);
     rows
 }
@@ -360,6 +375,7 @@ fn prepare(folder: &Path) {
         ("text", "# A text that is no weights file.\n"),
         ("token", "secret"),
         ("agents-only.toml", "[task]\nagents = 5"),
+        ("ring.toml", "[task]\nname = 'drones'\nagents = 5\nspawn = 'ring'"),
         ("open-table.toml", "\n[run"),
         ("no-section.toml", "run = 5"),
         ("twice.toml", "[run]\nseed = 1\nseed = 2"),
@@ -454,7 +470,9 @@ fn wrong_inputs_are_refused_with_the_code_and_the_name() {
     std::thread::scope(|scope| {
         for _ in 0..4 {
             scope.spawn(|| {
-                while let Some((k, row)) = Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|k| Some((k, rows.get(k)?))) {
+                while let Some((k, row)) =
+                    Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|k| Some((k, rows.get(k)?)))
+                {
                     let home = place.path().join(k.to_string());
                     std::fs::create_dir(&home).unwrap();
                     if let Some(problem) = trial(row, files.to_str().unwrap(), &home) {

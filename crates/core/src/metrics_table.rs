@@ -145,7 +145,7 @@ pub const METRICS: &[Metric] = &[
     },
     Metric {
         name: "spawn_success_rate",
-        help: "covered before the first step",
+        help: "covered before the first step: the success of a team that does nothing",
         label: "at spawn",
         replay: true,
         ..SHARE

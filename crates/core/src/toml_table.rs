@@ -48,7 +48,8 @@ fn explain(value: &Value, message: &str, bounds: Option<String>) -> String {
         let known = message.split_once("expected ").map_or("", |(_, known)| known.trim_start_matches("one of "));
         return format!("unknown key; use {}", choices(known));
     }
-    let expected = message.rsplit_once("expected ").map_or(message, |(_, expected)| expected);
+    // Our own types refuse in our own words.
+    let Some((_, expected)) = message.rsplit_once("expected ") else { return message.to_owned() };
     if message.starts_with("unknown variant") {
         return format!("{value} is unknown; use {}", choices(expected.trim_start_matches("one of ")));
     }

@@ -12,7 +12,15 @@ pub struct CommonOptions {
     #[arg(long, global = true)]
     pub json: bool,
     /// Format of standard error: text, or one JSON object per line.
-    #[arg(long, global = true, env = "MAGEX_LOG_FORMAT", value_enum, ignore_case = true, value_name = "FORMAT", default_value_t)]
+    #[arg(
+        long,
+        global = true,
+        env = "MAGEX_LOG_FORMAT",
+        value_enum,
+        ignore_case = true,
+        value_name = "FORMAT",
+        default_value_t
+    )]
     pub log_format: LogFormat,
     /// Log more (-v, -vv); RUST_LOG takes precedence.
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]

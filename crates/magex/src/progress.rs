@@ -5,7 +5,8 @@ use crate::output::{colours, note, thousands};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
 use magex_core::metrics_table::{
-    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, SECOND_COST_RATIO, SUCCESS_RATE, as_written,
+    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, SECOND_COST_RATIO, SUCCESS_RATE,
+    as_written,
 };
 use magex_learner::run_events::RunEvent;
 use magex_runtime::telemetry;

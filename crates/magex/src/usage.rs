@@ -33,7 +33,8 @@ impl FromEnvironment {
                 let text = argument.to_string_lossy();
                 text.strip_prefix(&option).is_some_and(|rest| rest.is_empty() || rest.starts_with('='))
             };
-            let from_environment = std::env::var_os(variable).is_some_and(|value| !value.is_empty()) && !arguments.iter().any(given);
+            let from_environment =
+                std::env::var_os(variable).is_some_and(|value| !value.is_empty()) && !arguments.iter().any(given);
             from_environment.then(|| (option, variable.to_string_lossy().into_owned()))
         };
         Self(called.unwrap_or(command).get_arguments().filter_map(set).collect())

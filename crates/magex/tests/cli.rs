@@ -322,7 +322,7 @@ fn a_commander_answers_the_command_line() {
 
     let run = place.trained("run");
     let trained = Commander::start(&place, "--model run");
-    let answer = place.json(&format!("assign --connect {} --random 12 --seed 1", trained.url));
+    let answer = place.json(&format!("assign --connect {} --random 12 --seed 1 --scheduler learned", trained.url));
     assert_eq!((&answer["scheduler"], &answer["weights_sha256"]), (&"learned".into(), &run["weights_sha256"]));
     assert!(answer["pairs"][3]["probability"].is_number());
     place.fails("commander --model nowhere", 64, &["nowhere"]);

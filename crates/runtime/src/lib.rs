@@ -6,6 +6,7 @@ pub mod client;
 pub mod exit;
 pub mod health;
 pub mod http;
+pub mod log_line;
 pub mod metrics;
 pub mod net;
 pub mod options;

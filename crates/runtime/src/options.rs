@@ -46,7 +46,9 @@ fn read(text: &str) -> Whole {
     let (before, after) = mantissa.split_once('.').unwrap_or((mantissa, "0"));
     let grouped = |part: &str| !part.starts_with('_') && !part.ends_with('_') && !part.is_empty();
     let digits: String = [before, after].concat().chars().filter(|&c| c != '_').collect();
-    let (Ok(exponent), true) = (exponent.parse::<i64>(), grouped(before) && grouped(after)) else { return Whole::Other };
+    let (Ok(exponent), true) = (exponent.parse::<i64>(), grouped(before) && grouped(after)) else {
+        return Whole::Other;
+    };
     if !digits.bytes().all(|byte| byte.is_ascii_digit()) {
         return Whole::Other;
     }

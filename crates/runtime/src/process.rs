@@ -1,6 +1,6 @@
 //! The process itself: its environment, its limits and its one line of standard output.
 
-use crate::telemetry::timestamp;
+use crate::log_line::timestamp;
 use std::ffi::OsString;
 use std::io::Write as _;
 use std::net::SocketAddr;
@@ -35,7 +35,8 @@ pub fn ensure_environment() -> std::io::Result<()> {
     let arenas = processors().to_string();
     let needed = ENVIRONMENT.into_iter().chain([(ARENAS, arenas.as_str())]);
     let mut missing = needed.filter(|(name, _)| std::env::var_os(name).is_none_or(|value| value.is_empty())).peekable();
-    let empty: Vec<OsString> = std::env::vars_os().filter_map(|(name, value)| value.is_empty().then_some(name)).collect();
+    let empty: Vec<OsString> =
+        std::env::vars_os().filter_map(|(name, value)| value.is_empty().then_some(name)).collect();
     let mut unset = empty.iter().filter(|name| is_optional(&name.to_string_lossy())).peekable();
     if missing.peek().is_none() && unset.peek().is_none() {
         return Ok(());

@@ -139,7 +139,9 @@ impl CallerArgs {
     /// As [`ClientArgs::read`].
     pub fn read(&self) -> Result<Settings, Failure> {
         if self.tls_cert.is_some() && self.client.tls_ca.is_none() {
-            return Err(Failure::usage("--tls-cert: a client's certificate needs --tls-ca, the CA of the services that see it"));
+            return Err(Failure::usage(
+                "--tls-cert: a client's certificate needs --tls-ca, the CA of the services that see it",
+            ));
         }
         self.client.read(self.tls_cert.as_deref().zip(self.tls_key.as_deref()), self.insecure)
     }

@@ -2,6 +2,8 @@
 
 use crate::client;
 use crate::exit::Failure;
+use crate::log_line;
+pub use crate::log_line::{is_json, line};
 use crate::trace;
 use opentelemetry::KeyValue;
 use opentelemetry::trace::TracerProvider as _;
@@ -9,12 +11,10 @@ use opentelemetry_otlp::{WithExportConfig as _, WithTonicConfig as _};
 use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::trace::{BatchConfigBuilder, BatchSpanProcessor, SdkTracerProvider, SpanData, SpanExporter};
-use std::io::{IsTerminal as _, Write as _};
+use std::io::IsTerminal as _;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tracing::{Metadata, Subscriber};
-use tracing_subscriber::fmt::format::Writer;
-use tracing_subscriber::fmt::time::{FormatTime as _, SystemTime};
 use tracing_subscriber::filter::{EnvFilter, FilterExt as _, filter_fn};
 use tracing_subscriber::layer::{Layer, SubscriberExt as _};
 use tracing_subscriber::registry::LookupSpan;
@@ -39,46 +39,13 @@ pub enum LogFormat {
     Json,
 }
 
-/// Whether everything on standard error is JSON.
-static JSON: AtomicBool = AtomicBool::new(false);
-
 impl LogFormat {
     /// Decides how this process writes to standard error, the message of a panic included.
     pub fn apply(self) {
-        let json = self == Self::Json;
-        if json && !JSON.swap(true, Ordering::Relaxed) {
-            std::panic::set_hook(Box::new(|panic| line("ERROR", &panic.to_string(), None)));
+        if self == Self::Json {
+            log_line::write_json();
         }
     }
-}
-
-/// Whether standard error carries JSON objects only.
-pub fn is_json() -> bool {
-    JSON.load(Ordering::Relaxed)
-}
-
-/// Writes a line to standard error that no filter removes: the text, or in the JSON format an object like those of the log.
-pub fn line(level: &str, message: &str, exit_code: Option<u8>) {
-    let text = match is_json() {
-        false => message.to_owned(),
-        true => {
-            let mut object = serde_json::json!({ "timestamp": timestamp(), "level": level, "message": message });
-            if let Some(code) = exit_code {
-                object["exit_code"] = code.into();
-            }
-            object.to_string()
-        }
-    };
-    // If it fails there is no other place to report it.
-    let _ = writeln!(std::io::stderr().lock(), "{text}");
-}
-
-/// The time of day as log lines have it.
-pub fn timestamp() -> String {
-    let mut text = String::new();
-    // Writing to a string does not fail.
-    let _ = SystemTime.format_time(&mut Writer::new(&mut text));
-    text
 }
 
 /// The option of every service that can be traced.
@@ -139,7 +106,9 @@ pub fn filter(default: &str) -> Result<EnvFilter, Failure> {
     let Some(wanted) = std::env::var_os(EnvFilter::DEFAULT_ENV) else { return Ok(EnvFilter::new(default)) };
     let wanted = wanted.to_string_lossy();
     EnvFilter::try_new(&*wanted).map_err(|_| {
-        Failure::usage(format!("RUST_LOG: '{wanted}' is no list of filters; write for example info, or info,magex_learner=debug"))
+        Failure::usage(format!(
+            "RUST_LOG: '{wanted}' is no list of filters; write for example info, or info,magex_learner=debug"
+        ))
     })
 }
 

@@ -15,7 +15,8 @@ pub struct ServerTls {
 impl ServerTls {
     /// Reads the server's certificate chain and key; with `client_ca`, every client must present a certificate of that CA.
     pub fn read(certificate: &Path, key: &Path, client_ca: Option<&Path>) -> Result<Self, Failure> {
-        let config = ServerTlsConfig::new().identity(Identity::from_pem(read("--tls-cert", certificate)?, read("--tls-key", key)?));
+        let config = ServerTlsConfig::new()
+            .identity(Identity::from_pem(read("--tls-cert", certificate)?, read("--tls-key", key)?));
         let config = match client_ca {
             Some(ca) => config.client_ca_root(Certificate::from_pem(read("--client-ca", ca)?)),
             None => config,

@@ -208,7 +208,7 @@ mod tests {
     fn invalid_files_are_rejected() {
         for (text, words) in [
             ("", "no [[identity]]"),
-            ("[[identity]]\nname = 'a'\nrole = 'king'", "unknown variant"),
+            ("[[identity]]\nname = 'a'\nrole = 'king'", "unknown name 'king'"),
             ("[[identity]]\nname = 'a'\nrole = 'client'", "identity[0]: give either"),
             ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = 'abc'", "64 hexadecimal"),
             ("[[identity]]\nname = ''\nrole = 'client'\ntoken_sha256 = 'abc'", "identity[0].name"),
