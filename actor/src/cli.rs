@@ -8,6 +8,7 @@ use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
 use magex_runtime::http;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::options;
 use magex_runtime::process;
 use magex_runtime::security::CallerArgs;
 use magex_runtime::service::{self, ServiceArgs};
@@ -29,13 +30,13 @@ pub struct ActorArgs {
     #[arg(long, env = "MAGEX_ACTOR_NAME", default_value_t = process::default_name(), hide_default_value = true)]
     pub name: String,
     /// Rollout threads [default: one per processor]
-    #[arg(long, env = "MAGEX_ACTOR_THREADS", default_value_t = process::processors(), hide_default_value = true)]
+    #[arg(long, env = "MAGEX_ACTOR_THREADS", default_value_t = process::processors(), hide_default_value = true, value_name = "T", value_parser = options::whole::<usize>(1, options::THREADS_MAX))]
     pub threads: usize,
     /// Work only for a run with the task of this configuration file
     #[arg(long, env = "MAGEX_CONFIG", value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Wait for another run when this one is complete
-    #[arg(long, env = "MAGEX_ACTOR_STAY")]
+    #[arg(long, env = "MAGEX_ACTOR_STAY", value_parser = options::switch)]
     pub stay: bool,
     /// Credentials for learner and commander.
     #[command(flatten)]
@@ -82,14 +83,18 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
 
 fn configure(args: &ActorArgs) -> Result<ActorConfig, Failure> {
     let fingerprint = |path: &PathBuf| {
-        let named = |error: &dyn std::fmt::Display| Failure::usage(format!("{}: {error}", path.display()));
-        let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
-        Ok(RunConfig::from_toml(&text).map_err(|error| named(&error))?.task.fingerprint())
+        let text = options::text_file("--config", path)?;
+        let config = RunConfig::from_toml(&text);
+        let named = |error| Failure::usage(format!("--config {}: {error}", path.display()));
+        Ok(config.map_err(named)?.task.fingerprint())
     };
+    let client = args.security.read()?;
+    client.check("--learner", &args.learner)?;
+    client.check("--commander", &args.commander)?;
     Ok(ActorConfig {
         learner_url: args.learner.clone(),
         commander_url: args.commander.clone(),
-        client: args.security.read()?,
+        client,
         actor_id: args.name.clone(),
         threads: args.threads,
         expected_task: args.config.as_ref().map(fingerprint).transpose()?,

@@ -11,6 +11,7 @@ use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
 use magex_runtime::http;
 use magex_runtime::metrics::Metrics;
+use magex_runtime::options;
 use magex_runtime::process;
 use magex_runtime::security::{ClientArgs, ServerArgs};
 use magex_runtime::service::{self, ServiceArgs};
@@ -46,31 +47,31 @@ pub struct CommanderArgs {
     #[serde(flatten)]
     pub client: ClientArgs,
     /// Maximum number of agents, and of goals, of a team
-    #[arg(long, default_value_t = 5000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000), help_heading = "Limits")]
+    #[arg(long, default_value_t = 5000, value_name = "N", value_parser = options::whole::<u32>(1, 10_000), help_heading = "Limits")]
     pub max_agents: u32,
     /// Maximum message size, MiB
-    #[arg(long, default_value_t = 32, value_name = "MIB", value_parser = clap::value_parser!(u32).range(1..=1024), help_heading = "Limits")]
+    #[arg(long, default_value_t = 32, value_name = "MIB", value_parser = options::whole::<u32>(1, 1024), help_heading = "Limits")]
     pub max_message: u32,
     /// Maximum number of calls in flight per client
-    #[arg(long, default_value_t = 64, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 64, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub calls_per_client: u32,
     /// Maximum number of open streams per client
-    #[arg(long, default_value_t = 16, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 16, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub streams_per_client: u32,
     /// Maximum number of missions of all clients
-    #[arg(long, default_value_t = 1000, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 1000, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub max_missions: u32,
     /// Maximum number of missions per client
-    #[arg(long, default_value_t = 100, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 100, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub missions_per_client: u32,
     /// Maximum number of agents, and of goals, of a mission
-    #[arg(long, default_value_t = 1000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=2000), help_heading = "Limits")]
+    #[arg(long, default_value_t = 1000, value_name = "N", value_parser = options::whole::<u32>(1, 2000), help_heading = "Limits")]
     pub mission_agents: u32,
     /// Hours after its last update at which a mission expires
-    #[arg(long, default_value_t = 24, value_name = "H", value_parser = clap::value_parser!(u32).range(1..=8760), help_heading = "Limits")]
+    #[arg(long, default_value_t = 24, value_name = "H", value_parser = options::whole::<u32>(1, 8760), help_heading = "Limits")]
     pub mission_hours: u32,
     /// Milliseconds for which a stopping service rejects calls with UNAVAILABLE before it closes its port
-    #[arg(long, default_value_t = 500, value_name = "MS", value_parser = clap::value_parser!(u32).range(..=5000))]
+    #[arg(long, default_value_t = 500, value_name = "MS", value_parser = options::whole::<u32>(0, 5000))]
     pub drain: u32,
     /// Options of every service
     #[command(flatten)]
@@ -85,6 +86,7 @@ impl CommanderArgs {
         let weights = self.weights.as_ref().map(find).transpose()?;
         let security = self.security.read(&self.listen)?;
         let client = self.client.read(self.security.own(), self.security.insecure)?;
+        self.learner.as_deref().map_or(Ok(()), |url| client.check("--learner", url))?;
         let each = MissionLimits {
             members: self.mission_agents as usize,
             lifetime_ms: i64::from(self.mission_hours) * 3_600_000,

@@ -5,8 +5,9 @@ use crate::scheduler::{LoadScheduler, WeightsKey};
 use magex_core::ids::{RunId, WeightsVersion};
 use magex_proto::weights::sha256_hex;
 use magex_runtime::exit::Failure;
+use magex_runtime::options;
 use std::fmt::Display;
-use std::io::Read as _;
+use std::io::{ErrorKind, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -23,6 +24,8 @@ const CONFIG: &str = "config.toml";
 pub struct WeightsFile {
     weights: PathBuf,
     config: PathBuf,
+    /// The option that names it, unless it is beside the weights.
+    option: &'static str,
     name: String,
 }
 
@@ -31,11 +34,12 @@ fn unusable(path: &Path, problem: impl Display) -> Failure {
     Failure::usage(format!("{}: {problem}", path.display()))
 }
 
-/// Whether a file begins like weights: the length of a JSON object, and that object.
-fn is_safetensors(path: &Path) -> bool {
+/// A file of this format begins with the length of its header, which is JSON.
+fn looks_like_weights(path: &Path) -> bool {
     let mut start = [0; 9];
     let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
-    read.is_ok() && start[8] == b'{'
+    // A file that cannot be read gets the error of its reading.
+    read.map_or_else(|error| error.kind() != ErrorKind::UnexpectedEof, |()| start[8] == b'{')
 }
 
 /// Modification time and size of both files; when it differs they are read.
@@ -53,11 +57,18 @@ impl WeightsFile {
         } else {
             (path.to_owned(), path.with_file_name(CONFIG))
         };
+        let option = if config.is_some() { "--config" } else { "" };
         let config = config.map_or(beside, Path::to_owned);
+        if path.is_file() && !looks_like_weights(path) {
+            return Err(unusable(
+                path,
+                "not a weights file (safetensors); give the folder of a finished run, or its weights file",
+            ));
+        }
         if !weights.is_file() {
             return Err(unusable(&weights, "no such file; give the folder of a finished run, or its weights file"));
         }
-        if !config.is_file() && !is_safetensors(&weights) {
+        if !config.is_file() && !looks_like_weights(&weights) {
             return Err(unusable(
                 &weights,
                 "no weights file; give the folder of a finished run, or its weights.safetensors",
@@ -66,7 +77,7 @@ impl WeightsFile {
         if !config.is_file() {
             return Err(unusable(&config, "no such file; give the run's configuration with --config"));
         }
-        Ok(Self { weights, config, name })
+        Ok(Self { weights, config, option, name })
     }
 
     /// Reads both files and loads the model, on a thread that may block. Returns their hashes, too, to detect a change of content.
@@ -77,8 +88,9 @@ impl WeightsFile {
     }
 
     fn load_here(&self, version: u32, load_scheduler: LoadScheduler) -> Result<(Model, Content), Failure> {
-        let bytes = std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, error))?;
-        let toml = std::fs::read_to_string(&self.config).map_err(|error| unusable(&self.config, error))?;
+        let bytes =
+            std::fs::read(&self.weights).map_err(|error| unusable(&self.weights, options::unreadable(&error)))?;
+        let toml = options::text_file(self.option, &self.config)?;
         let scheduler = load_scheduler(&bytes, &toml).map_err(|error| unusable(&self.weights, error))?;
         let (run_id, sha256) = (RunId(self.name.clone()), sha256_hex(&bytes));
         let content = [sha256.clone(), sha256_hex(toml.as_bytes())];

@@ -48,7 +48,7 @@ pub enum CheckpointError {
     },
     /// There are some, and all are damaged.
     #[error(
-        "{run}: none of {count} checkpoints can be used, the newest because of {newest}; restore one, or start the run anew with another --out"
+        "{run}: none of the {count} checkpoints is usable; the newest: {newest}; restore a backup, or start anew with another --out"
     )]
     Unusable {
         /// Folder of the run.

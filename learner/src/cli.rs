@@ -8,13 +8,14 @@ use crate::serve::service::learner_service;
 use crate::serve::validate::Limits;
 use crate::trainer::{TrainError, TrainOutcome, Trainer, max_shard_episodes};
 use clap::Args;
-use magex_core::config::RunConfig;
+use magex_core::config::{RunConfig, SEED_MAX};
 use magex_core::ids::RunId;
 use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::exit::{self, Failure};
 use magex_runtime::health::probe;
 use magex_runtime::limits;
+use magex_runtime::options;
 use magex_runtime::process;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
@@ -38,37 +39,37 @@ pub struct LearnerArgs {
     #[arg(long, env = "MAGEX_CONFIG", value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Seed of the run, in place of the configuration's
-    #[arg(long, env = "MAGEX_SEED")]
+    #[arg(long, env = "MAGEX_SEED", value_name = "S", value_parser = options::whole::<u64>(0, SEED_MAX))]
     pub seed: Option<u64>,
     /// Folder of the run
     #[arg(long, env = "MAGEX_OUT", default_value = "runs/run", value_name = "FOLDER")]
     pub out: PathBuf,
     /// Continue the run in that folder
-    #[arg(long, env = "MAGEX_RESUME")]
+    #[arg(long, env = "MAGEX_RESUME", value_parser = options::switch)]
     pub resume: bool,
     /// Continue the run in that folder if there is one, begin it otherwise: for supervisors that repeat the same command
-    #[arg(long, env = "MAGEX_RESUME_OR_CREATE", conflicts_with = "resume")]
+    #[arg(long, env = "MAGEX_RESUME_OR_CREATE", value_parser = options::switch)]
     pub resume_or_create: bool,
     /// Begin a new run from the weights of another one: its newest checkpoint
     #[arg(long, env = "MAGEX_FROM", value_name = "RUN")]
     pub from: Option<PathBuf>,
     /// With --from: begin with the state of its optimiser, too
-    #[arg(long, env = "MAGEX_KEEP_OPTIMISER", requires = "from")]
+    #[arg(long, env = "MAGEX_KEEP_OPTIMISER", value_parser = options::switch)]
     pub keep_optimiser: bool,
     /// Continue serving after the run is complete, until shutdown
-    #[arg(long, env = "MAGEX_LEARNER_STAY")]
+    #[arg(long, env = "MAGEX_LEARNER_STAY", value_parser = options::switch)]
     pub stay: bool,
     /// Address to listen on; port 0 is any free one
     #[arg(long, env = "MAGEX_LEARNER_LISTEN", default_value = "127.0.0.1:7000", value_name = "HOST:PORT")]
     pub listen: String,
     /// Silence after which an actor loses its leases
-    #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS")]
+    #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS", value_parser = options::number(0.1, 3600.0))]
     pub lease_seconds: f64,
     /// TLS and access rules of the port.
     #[command(flatten)]
     pub security: ServerArgs,
     /// Training threads [default: one per processor]
-    #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true)]
+    #[arg(long, env = "MAGEX_LEARNER_THREADS", default_value_t = process::processors(), hide_default_value = true, value_name = "T", value_parser = options::whole::<usize>(1, options::THREADS_MAX))]
     pub threads: usize,
     /// Descriptor of the run folder's lock, which the supervisor of this process holds
     #[arg(long, hide = true)]
@@ -85,6 +86,12 @@ const COMMAND: &str = "magex learner";
 pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
     if args.service.health_check {
         return probe::own(&args.listen, args.security.tls_cert.is_some());
+    }
+    if args.resume && args.resume_or_create {
+        return Err(Failure::usage("--resume and --resume-or-create: give one of them"));
+    }
+    if args.keep_optimiser && args.from.is_none() {
+        return Err(Failure::usage("--keep-optimiser: give the run that it comes from with --from"));
     }
     let state = RunFolderState::of(&args.out);
     args.resume |= args.resume_or_create && state == RunFolderState::Run;
@@ -226,11 +233,11 @@ fn configure(args: &LearnerArgs, parent: Option<&Parent>) -> Result<RunConfig, F
         checkpoint::check_format(&args.out).map_err(Failure::usage)?;
     }
     let own = || args.resume.then(|| args.out.join(CONFIG_FILE));
+    let option = if args.config.is_some() { "--config" } else { "" };
     let mut config = match (args.config.clone().or_else(own), parent) {
         (Some(path), _) => {
-            let named = |error: &dyn Display| Failure::usage(format!("{}: {error}", path.display()));
-            let text = std::fs::read_to_string(&path).map_err(|error| named(&error))?;
-            RunConfig::from_toml(&text).map_err(|error| named(&error))?
+            let named = |error| Failure::usage(format!("{option} {}: {error}", path.display()).trim_start());
+            RunConfig::from_toml(&options::text_file(option, &path)?).map_err(named)?
         }
         (None, Some(parent)) => parent.config(),
         (None, None) => RunConfig::from_toml("").map_err(Failure::usage)?,

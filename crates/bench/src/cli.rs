@@ -2,9 +2,10 @@
 
 use crate::report::Report;
 use crate::{assign, cluster, env, goals, runs, soak, tasks, training, update};
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
 use magex::failure;
 use magex::options::CommonOptions;
+use magex::usage::{self, FromEnvironment};
 use magex_runtime::exit;
 use serde_json::{Map, Value, json};
 use std::process::ExitCode;
@@ -87,12 +88,14 @@ const ALL: [&[&str]; 9] = [
 
 /// Parses the arguments, measures, and prints the tables.
 pub(crate) fn main() -> ExitCode {
-    match Cli::try_parse() {
+    let arguments: Vec<_> = std::env::args_os().collect();
+    match Cli::try_parse_from(&arguments) {
         Ok(cli) => {
-            cli.options.init_logging();
-            failure::exit_code(run(&cli), &cli.options)
+            cli.options.log_format.apply();
+            let result = cli.options.init_logging().and_then(|()| run(&cli));
+            failure::exit_code(result, &cli.options, &FromEnvironment::default())
         }
-        Err(error) => failure::usage_of(&error),
+        Err(error) => usage::report(&Cli::command(), &arguments, &error),
     }
 }
 
@@ -140,7 +143,6 @@ fn measure(what: &What) -> anyhow::Result<Report> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory as _;
 
     #[test]
     fn the_command_line_is_consistent_and_every_preset_parses() {

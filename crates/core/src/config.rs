@@ -42,13 +42,20 @@ pub struct RunConfig {
     pub mappo: MappoConfig,
 }
 
+/// Limit of the seed of a run: what TOML's whole numbers hold.
+pub const SEED_MAX: u64 = i64::MAX as u64;
+/// Limit of the budget of a run.
+pub const STEPS_MAX: u64 = 1_000_000_000_000;
+/// Limit of the episodes of an iteration.
+const EPISODES_MAX: u32 = 100_000;
+
 section! {
     /// `[run]`
     RunSection {
         /// Seed of every random stream.
-        seed: u64 = 1, 0..=i64::MAX as u64;
+        seed: u64 = 1, 0..=SEED_MAX;
         /// Budget: joint environment steps to train on.
-        max_steps: u64 = 20_000, 1..=1_000_000_000_000;
+        max_steps: u64 = 20_000, 1..=STEPS_MAX;
         /// Stop when two consecutive evaluations reach this greedy success rate; above 1 never stops early.
         target_success: f32 = 0.995, 0.0..=2.0;
         /// Evaluate every this many iterations.
@@ -315,7 +322,7 @@ impl RunConfig {
             return Err(FieldError::new("executor.feature_size", problem));
         }
         let CollectConfig { episodes_per_iteration: episodes, shards_per_iteration: shards } = self.collect;
-        check_range("collect.episodes_per_iteration", episodes, 1, 100_000)?;
+        check_range("collect.episodes_per_iteration", episodes, 1, EPISODES_MAX)?;
         check_range("collect.shards_per_iteration", shards, 1, episodes)?;
         if episodes % shards != 0 {
             let problem = format!("{shards} must divide collect.episodes_per_iteration = {episodes}");

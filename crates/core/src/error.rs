@@ -62,7 +62,7 @@ pub(crate) fn check_range<T: PartialOrd + std::fmt::Display>(
     if value >= low && value <= high {
         Ok(())
     } else {
-        Err(FieldError::new(field, format!("{value} is outside {low}..={high}")))
+        Err(FieldError::new(field, format!("{value} is out of range; write a number from {low} to {high}")))
     }
 }
 

@@ -145,7 +145,7 @@ pub const METRICS: &[Metric] = &[
     },
     Metric {
         name: "spawn_success_rate",
-        help: "covered before the first step",
+        help: "covered before the first step: the success of a team that does nothing",
         label: "at spawn",
         replay: true,
         ..SHARE
@@ -242,6 +242,12 @@ impl Metric {
             Format::Decimals(digits) => format!("{value:.digits$}"),
         }
     }
+}
+
+/// A mean of single-precision numbers as the shortest decimal number that is the same in single precision: 0.69 in place of
+/// 0.6900000135600567. What a mean has beyond that is rounding.
+pub fn as_written(mean: f64) -> f64 {
+    (mean as f32).to_string().parse().unwrap_or(mean)
 }
 
 /// A share between 0 and 1: four decimals, and never rounded up to 1.

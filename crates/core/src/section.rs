@@ -19,6 +19,15 @@ macro_rules! section {
         }
 
         impl $name {
+            /// The range of a key, in words.
+            pub(crate) fn bounds(key: &str) -> Option<String> {
+                $($(if key == stringify!($key) {
+                    let (low, high): ($type, $type) = ($low, $high);
+                    return Some(format!("{low} to {high}"));
+                })?)*
+                None
+            }
+
             /// `Ok` if every value is in its range; `section` is the section's dotted name.
             pub(crate) fn check_ranges(&self, section: &str) -> Result<(), $crate::error::FieldError> {
                 let key = |name| $crate::toml_table::dotted(section, name);

@@ -133,6 +133,22 @@ struct RawTask {
     sections: Table,
 }
 
+/// Limit of the agents of a team.
+pub const AGENTS_MAX: usize = 5000;
+/// Limit of the joint steps of an episode.
+pub const HORIZON_MAX: u32 = 100_000;
+
+/// The ranges of the keys of `[task]`, in words.
+fn bounds(key: &str) -> Option<String> {
+    match key {
+        "agents" => Some(format!("1 to {AGENTS_MAX}")),
+        "side" => Some("above 0 to 10000".to_owned()),
+        "horizon" => Some(format!("1 to {HORIZON_MAX}")),
+        "layout_scale" => Some("0.01 to 100".to_owned()),
+        _ => None,
+    }
+}
+
 /// The problem of an explicit zero where it would have no meaning.
 pub(crate) const NOT_ZERO: &str = "0 is not a size; leave it out for the default";
 
@@ -142,10 +158,14 @@ pub const TASK_SEMANTICS: u32 = 2;
 /// Reads the keys of `[task]` and fills in what is missing; ranges are checked by [`TaskConfig::validate`]. Errors name a
 /// missing key, an explicit zero, an unknown key or a setting of another task.
 pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
-    let raw: RawTask = toml_table::read("task", keys)?;
-    let name = raw.name.ok_or_else(|| FieldError::missing("task.name"))?;
-    let agents = raw.agents.ok_or_else(|| FieldError::missing("task.agents"))?;
-    let spawn = raw.spawn.ok_or_else(|| FieldError::missing("task.spawn"))?;
+    let raw: RawTask = toml_table::read("task", keys, bounds)?;
+    let missing = |key: &str| {
+        let remedy = "missing; a [task] section needs name (simple-spread, push-ball or drones), agents and spawn";
+        FieldError::new(format!("task.{key}"), remedy)
+    };
+    let name = raw.name.ok_or_else(|| missing("name"))?;
+    let agents = raw.agents.ok_or_else(|| missing("agents"))?;
+    let spawn = raw.spawn.ok_or_else(|| missing("spawn"))?;
     for (key, zero) in [
         ("side", raw.side == Some(0.0)),
         ("horizon", raw.horizon == Some(0)),
@@ -287,11 +307,11 @@ impl TaskConfig {
 
     /// Checks ranges; an error names the field and the remedy.
     pub fn validate(&self) -> Result<(), FieldError> {
-        check_range("task.agents", self.agents, 1, 5000)?;
+        check_range("task.agents", self.agents, 1, AGENTS_MAX)?;
         if !(self.side.is_finite() && self.side > 0.0 && self.side <= 10_000.0) {
             return Err(FieldError::new("task.side", format!("{} must be a positive length up to 10000", self.side)));
         }
-        check_range("task.horizon", self.horizon, 1, 100_000)?;
+        check_range("task.horizon", self.horizon, 1, HORIZON_MAX)?;
         check_range("task.layout_scale", self.layout_scale, 0.01, 100.0)?;
         (self.definition().validate)(self)
     }

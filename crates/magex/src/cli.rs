@@ -4,7 +4,8 @@ use crate::commands::{assign, bench, eval, health, replay, roles, train, train_c
 use crate::failure;
 use crate::options::CommonOptions;
 use crate::output::note;
-use clap::{Parser, Subcommand};
+use crate::usage::{self, FromEnvironment, taking_negative_numbers};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use magex_runtime::{exit, shutdown};
 use std::process::ExitCode;
 
@@ -19,9 +20,9 @@ Exit codes:
    75  stopped before the end; --resume continues
   130  interrupted twice
 
-With --json the last line of standard output is one JSON object; progress and
-logs go to standard error. RUST_LOG sets what is logged (for example
-RUST_LOG=magex_learner=debug); NO_COLOR turns colours off.";
+With --json the last line of standard output is one JSON object; progress and logs go to standard error, with --log-format json as one object per line.
+RUST_LOG sets what is logged (for example RUST_LOG=magex_learner=debug); NO_COLOR turns colours off.
+Whole numbers may be written as 1e6, 10_000 or 5M. An empty variable counts as not set.";
 
 /// Trains teams of agents to navigate and assigns goals to them (MAGE-X).
 ///
@@ -51,19 +52,28 @@ enum Command {
     Commander(roles::CommanderRole),
 }
 
+/// The commands and their options.
+pub fn definition() -> clap::Command {
+    taking_negative_numbers(Cli::command())
+}
+
 /// Parses the arguments, runs the command, and reports the result.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse_from(roles::by_name(std::env::args_os())) {
+    let arguments = roles::by_name(std::env::args_os());
+    let mut command = definition();
+    let parsed = command.try_get_matches_from_mut(&arguments).and_then(|matches| Cli::from_arg_matches(&matches));
+    let cli = match parsed {
         Ok(cli) => cli,
-        Err(error) => {
-            return failure::usage_of(&error);
-        }
+        Err(error) => return usage::report(&command, &arguments, &error),
     };
     let options = cli.options;
     shutdown::survive_file_size_limit();
+    options.log_format.apply();
     if !matches!(cli.command, Command::Learner(_) | Command::Actor(_) | Command::Commander(_)) {
         // Services set up their own logging.
-        options.init_logging();
+        if let Err(error) = options.init_logging() {
+            return failure::exit_code(Err(error), &options, &FromEnvironment::default());
+        }
     }
     let result = match &cli.command {
         Command::Train(args) => train::run(args, &options),
@@ -78,7 +88,7 @@ pub fn main() -> ExitCode {
         Command::Actor(role) => roles::actor(role),
         Command::Commander(role) => roles::commander(role),
     };
-    failure::exit_code(result, &options)
+    failure::exit_code(result, &options, &FromEnvironment::of(&command, &arguments))
 }
 
 /// Reports that the process could not re-execute itself with the environment variables that it needs.
@@ -90,7 +100,6 @@ pub fn cannot_start(error: &std::io::Error) -> ExitCode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory as _;
 
     #[test]
     fn the_command_line_is_consistent_and_every_command_explains_itself() {

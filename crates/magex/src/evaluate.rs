@@ -8,9 +8,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
-use magex_core::task::Spawn;
+use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
+use magex_runtime::options;
 use magex_runtime::sync::lock;
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -100,7 +101,7 @@ pub(crate) struct Variation {
     #[arg(long, value_name = "MODE")]
     pub(crate) spawn: Option<Spawn>,
     /// Team size; the map scales with it. Not for the mlp executor and the ranking scheduler, which have a fixed size.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = options::whole::<usize>(1, AGENTS_MAX as u64))]
     pub(crate) agents: Option<usize>,
     /// Goal scheduler: pairwise, ranking, exact or random.
     #[arg(long, value_name = "KIND")]
@@ -109,7 +110,7 @@ pub(crate) struct Variation {
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub(crate) controller: Controller,
     /// Joint steps per episode.
-    #[arg(long, value_name = "T")]
+    #[arg(long, value_name = "T", value_parser = options::whole::<u32>(1, HORIZON_MAX.into()))]
     pub(crate) horizon: Option<u32>,
 }
 
@@ -169,10 +170,11 @@ pub(crate) struct Episodes {
 /// Parses an evaluation set; the sets that training uses are rejected.
 fn eval_set(text: &str) -> Result<u32, String> {
     let first = EVAL_SET_TRAINING.max(EVAL_SET_FINAL) + 1;
-    match text.parse() {
-        Ok(set) if set >= first => Ok(set),
-        _ => Err(format!("sets below {first} belong to training; use {first} or more")),
+    let set = options::whole(0, u32::MAX.into())(text)?;
+    if set < first {
+        return Err(format!("sets below {first} belong to training; use {first} or more"));
     }
+    Ok(set)
 }
 
 /// Shows how many episodes are done: a line that moves in a terminal, log lines elsewhere.
@@ -281,7 +283,7 @@ mod tests {
 
     #[test]
     fn training_sets_are_rejected() {
-        for set in ["0", "1", "2", "x"] {
+        for set in ["0", "1", "2"] {
             assert!(eval_set(set).unwrap_err().contains("3 or more"));
         }
         assert_eq!(eval_set("100"), Ok(EVAL_SET));

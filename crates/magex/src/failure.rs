@@ -1,7 +1,8 @@
 //! Errors that carry the exit code of the process.
 
 use crate::options::CommonOptions;
-use crate::output::note;
+use crate::output::fatal;
+use crate::usage::FromEnvironment;
 use magex_core::config::ConfigError;
 use magex_learner::trainer::TrainError;
 use magex_runtime::exit::{self, Failure};
@@ -28,19 +29,11 @@ pub fn coded(code: u8, message: impl fmt::Display) -> anyhow::Error {
     anyhow::Error::new(Failure::new(code, message))
 }
 
-/// Prints an error of the command line parser; help and version count as success.
-pub fn usage_of(error: &clap::Error) -> ExitCode {
-    // If printing fails there is no other place to report it.
-    let _ = error.print();
-    ExitCode::from(if error.use_stderr() { exit::USAGE } else { exit::OK })
-}
-
 /// The exit code of a command; reports its error.
-pub fn exit_code(result: anyhow::Result<u8>, options: &CommonOptions) -> ExitCode {
+pub fn exit_code(result: anyhow::Result<u8>, options: &CommonOptions, variables: &FromEnvironment) -> ExitCode {
     ExitCode::from(result.unwrap_or_else(|error| {
         let code = code_of(&error);
-        note(format!("error: {error:#}"));
-        options.output().result(&serde_json::json!({ "error": format!("{error:#}"), "exit_code": code }));
+        fatal(&variables.named(&format!("{error:#}")), code, options.json);
         code
     }))
 }

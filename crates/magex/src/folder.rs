@@ -35,6 +35,22 @@ pub(crate) fn default_name(config: &RunConfig) -> String {
     format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed)
 }
 
+/// The folder of all runs, unless an option says otherwise.
+pub(crate) const RUNS: &str = "runs";
+
+/// Parses the name of a run folder within [`RUNS`].
+pub(crate) fn name(text: &str) -> Result<String, String> {
+    let plain = Path::new(text).file_name().is_some_and(|name| name == text);
+    if plain { Ok(text.to_owned()) } else { Err(format!("'{text}' is no name of a folder; --out takes a path")) }
+}
+
+/// The run in [`RUNS`] that was written to last.
+pub(crate) fn newest() -> Option<PathBuf> {
+    let folders = std::fs::read_dir(RUNS).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let runs = folders.filter(|folder| folder.join(CONFIG).is_file());
+    runs.max_by_key(|folder| std::fs::metadata(folder.join("metrics.jsonl")).and_then(|file| file.modified()).ok())
+}
+
 /// Creates and locks the folder of a new run with its configuration: `out`, or `runs/<name>` with -2, -3, … if it is taken. With
 /// `again`, a run in `out` that ended before its first checkpoint begins again.
 pub(crate) fn begin(
@@ -50,7 +66,7 @@ pub(crate) fn begin(
     let mut number = 1u32;
     loop {
         let suffix = if number == 1 { String::new() } else { format!("-{number}") };
-        let folder = Path::new("runs").join(format!("{name}{suffix}"));
+        let folder = Path::new(RUNS).join(format!("{name}{suffix}"));
         number += 1;
         // One that exists is not touched, even if it is empty: another process may be about to begin in it.
         if folder.symlink_metadata().is_ok() {
@@ -106,7 +122,7 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
             return Err(usage(format!("{} is a file: add --config with the run's config.toml", path.display())));
         };
         let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
-        let config = crate::settings::read(Some(config))?;
+        let config = crate::settings::read_from("--config", config)?;
         let (sha256, name) = (sha256::hex(&weights), path.display().to_string());
         return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new(), is_final: true });
     }

@@ -3,7 +3,7 @@
 //! | module | content |
 //! |---|---|
 //! | [`cli`], `commands` | the command line: one file per command |
-//! | [`options`], [`settings`], [`output`], [`failure`] | what every command shares: options, configuration, printing, exit codes |
+//! | [`options`], [`settings`], [`usage`], [`output`], [`failure`] | what every command shares: options, configuration, refusals, printing, exit codes |
 //! | [`local`], `evaluate` | rollouts in this process, for training and for evaluation |
 //! | [`supervise`] | training with learner, commander and actors as child processes |
 //! | [`folder`], `artifacts` | run folders, and the pictures in them |
@@ -16,6 +16,7 @@ pub mod options;
 pub mod output;
 pub mod settings;
 pub mod supervise;
+pub mod usage;
 
 mod artifacts;
 mod commands;

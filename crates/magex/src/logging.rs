@@ -2,10 +2,9 @@
 
 use indicatif::ProgressBar;
 use magex_runtime::sync::lock;
-use magex_runtime::telemetry::LogFormat;
+use magex_runtime::telemetry::{self, LogFormat};
 use std::io::{IsTerminal as _, Write};
 use std::sync::Mutex;
-use tracing_subscriber::EnvFilter;
 
 static LIVE: Mutex<Option<ProgressBar>> = Mutex::new(None);
 
@@ -24,13 +23,13 @@ pub(crate) fn around_live_line(write: impl FnOnce()) {
 }
 
 /// Sends logs to standard error. `RUST_LOG` decides what is shown; without it `info`, or more with `-v` and `-vv`.
-pub(crate) fn init(format: LogFormat, verbose: u8) {
+pub(crate) fn init(format: LogFormat, verbose: u8) -> anyhow::Result<()> {
     let default = match verbose {
         0 => "info",
         1 => "debug",
         _ => "trace",
     };
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
+    let filter = telemetry::filter(default)?;
     // An error would be printed where it occurred, and a thread that cannot print panics: a closed terminal, a full disk.
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(|| Line).log_internal_errors(false);
     // A second call has no effect.
@@ -38,6 +37,7 @@ pub(crate) fn init(format: LogFormat, verbose: u8) {
         LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).with_target(false).try_init(),
         LogFormat::Json => builder.json().flatten_event(true).try_init(),
     };
+    Ok(())
 }
 
 /// Standard error, above the status line.

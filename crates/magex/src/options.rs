@@ -11,8 +11,16 @@ pub struct CommonOptions {
     /// Print one JSON object as the last line of standard output.
     #[arg(long, global = true)]
     pub json: bool,
-    /// Format of log lines on standard error.
-    #[arg(long, global = true, value_enum, value_name = "FORMAT", default_value_t)]
+    /// Format of standard error: text, or one JSON object per line.
+    #[arg(
+        long,
+        global = true,
+        env = "MAGEX_LOG_FORMAT",
+        value_enum,
+        ignore_case = true,
+        value_name = "FORMAT",
+        default_value_t
+    )]
     pub log_format: LogFormat,
     /// Log more (-v, -vv); RUST_LOG takes precedence.
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
@@ -21,8 +29,11 @@ pub struct CommonOptions {
 
 impl CommonOptions {
     /// Sends logs to standard error.
-    pub fn init_logging(&self) {
-        logging::init(self.log_format, self.verbose);
+    ///
+    /// # Errors
+    /// RUST_LOG is wrong.
+    pub fn init_logging(&self) -> anyhow::Result<()> {
+        logging::init(self.log_format, self.verbose)
     }
 
     /// Where results go.

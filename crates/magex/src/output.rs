@@ -1,5 +1,6 @@
 //! Results on standard output: text and tables, or one JSON object on the last line.
 
+use magex_runtime::telemetry;
 use serde_json::Value;
 use std::io::{IsTerminal as _, Write as _};
 
@@ -22,7 +23,7 @@ impl Output {
         let text = text.as_ref();
         // A closed pipe is no error.
         let _ = match self.json {
-            true => writeln!(std::io::stderr().lock(), "{text}"),
+            true => Ok(telemetry::line("INFO", text, None)),
             false => writeln!(std::io::stdout().lock(), "{text}"),
         };
     }
@@ -38,9 +39,14 @@ impl Output {
 
 /// Prints a line to standard error.
 pub fn note(text: impl AsRef<str>) {
-    crate::logging::around_live_line(|| {
-        let _ = writeln!(std::io::stderr().lock(), "{}", text.as_ref());
-    });
+    crate::logging::around_live_line(|| telemetry::line("INFO", text.as_ref(), None));
+}
+
+/// Reports the error that ends the process.
+pub(crate) fn fatal(text: &str, code: u8, json: bool) {
+    let message = if telemetry::is_json() { text.to_owned() } else { format!("error: {text}") };
+    crate::logging::around_live_line(|| telemetry::line("ERROR", &message, Some(code)));
+    Output::new(json).result(&serde_json::json!({ "error": text, "exit_code": code }));
 }
 
 pub(crate) fn colours() -> bool {

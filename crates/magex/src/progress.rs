@@ -6,8 +6,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use magex_core::config::RunConfig;
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, SECOND_COST_RATIO, SUCCESS_RATE,
+    as_written,
 };
 use magex_learner::run_events::RunEvent;
+use magex_runtime::telemetry;
 use serde::Deserialize;
 use serde_json::Value;
 use std::io::IsTerminal as _;
@@ -70,12 +72,12 @@ pub(crate) struct Progress {
 
 impl Progress {
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
-        let target = f64::from(config.run.target_success);
+        let target = as_written(config.run.target_success.into());
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
         let metrics = (0..METRICS.len()).filter(shown).collect();
         let mut progress =
             Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
-        if !std::io::stderr().is_terminal() {
+        if !std::io::stderr().is_terminal() || telemetry::is_json() {
             tracing::info!(
                 out,
                 task = %config.task.name,
@@ -151,8 +153,8 @@ impl Progress {
             tracing::info!(
                 iteration = row.iteration,
                 joint_env_steps = row.joint_env_steps,
-                success = row.metric(SUCCESS_RATE).map(rounded),
-                sampled_success = row.sampled(SUCCESS_RATE).map(rounded),
+                success_rate = row.metric(SUCCESS_RATE).map(rounded),
+                sampled_success_rate = row.sampled(SUCCESS_RATE).map(rounded),
                 arrival_step = row.metric(ARRIVAL_STEP).map(rounded),
                 collisions_per_agent_step = row.metric(COLLISIONS_PER_AGENT_STEP).map(rounded),
                 collision_rate = crashed.map(rounded),

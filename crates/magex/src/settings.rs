@@ -1,9 +1,9 @@
 //! The effective configuration of a run: defaults, then the file, then the options of the command.
 
-use crate::failure::usage;
 use anyhow::Context as _;
-use magex_core::config::{ConfigError, ExecutorKind, RunConfig};
-use magex_core::task::Spawn;
+use magex_core::config::{ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX};
+use magex_core::task::{AGENTS_MAX, Spawn};
+use magex_runtime::options;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 
@@ -12,20 +12,22 @@ use std::path::Path;
 #[command(next_help_heading = "Configuration (overrides the file)")]
 pub(crate) struct Overrides {
     /// Seed of every random stream [run.seed].
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", value_parser = options::whole::<u64>(0, SEED_MAX))]
     pub(crate) seed: Option<u64>,
     /// Budget in joint environment steps [run.max_steps].
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = options::whole::<u64>(1, STEPS_MAX))]
     pub(crate) max_steps: Option<u64>,
-    /// Stop when two evaluations in a row reach this greedy success rate; a value above 1 never stops early
-    /// [run.target_success].
-    #[arg(long, value_name = "X")]
+    /// Stop when two evaluations in a row reach this greedy success rate [run.target_success].
+    #[arg(long, value_name = "X", value_parser = options::number::<f32>(0.0, 2.0))]
     pub(crate) target_success: Option<f32>,
+    /// Spend the whole budget, whatever success the evaluations reach [run.target_success = 2].
+    #[arg(long, conflicts_with = "target_success")]
+    pub(crate) whole_budget: bool,
     /// Architecture: magex, magex-literal, attention, mlp or local [executor.kind].
     #[arg(long, value_name = "KIND", value_parser = named::<ExecutorKind>)]
     pub(crate) executor: Option<ExecutorKind>,
     /// Team size; side, horizon and layout follow it [task.agents].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = options::whole::<usize>(1, AGENTS_MAX as u64))]
     pub(crate) agents: Option<usize>,
     /// Starts: uniform, lines, lines-0..3, authors or authors-0..3 [task.spawn].
     #[arg(long, value_name = "MODE")]
@@ -38,7 +40,8 @@ impl Overrides {
         let run = &mut config.run;
         run.seed = self.seed.unwrap_or(run.seed);
         run.max_steps = self.max_steps.unwrap_or(run.max_steps);
-        run.target_success = self.target_success.unwrap_or(run.target_success);
+        let target = self.whole_budget.then_some(2.0).or(self.target_success);
+        run.target_success = target.unwrap_or(run.target_success);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
             // Keys that were derived from the team size are derived again; keys that were set stay.
@@ -55,33 +58,35 @@ impl Overrides {
 
 /// Reads a configuration file; without one, the defaults.
 pub fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
-    let Some(path) = path else { return Ok(RunConfig::default()) };
-    let text = std::fs::read_to_string(path)
-        .map_err(|error| usage(format!("configuration file {}: {error}", path.display())))?;
-    RunConfig::from_toml(&text).with_context(|| path.display().to_string())
+    path.map_or_else(|| Ok(RunConfig::default()), |path| read_from("", path))
+}
+
+/// Reads the configuration file that an option names.
+pub(crate) fn read_from(option: &str, path: &Path) -> anyhow::Result<RunConfig> {
+    let text = options::text_file(option, path)?;
+    RunConfig::from_toml(&text).with_context(|| format!("{option} {}", path.display()).trim_start().to_owned())
 }
 
 /// Parses a name of the configuration, such as an executor.
 pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
-    serde_json::from_value(text.into()).map_err(|error| error.to_string().replace("unknown variant", "unknown name"))
+    serde_json::from_value(text.into()).map_err(|error| {
+        let error = error.to_string();
+        let known = error.rsplit_once("expected one of ").map_or("", |(_, known)| known).replace('`', "");
+        format!("'{text}' is unknown; use one of {known}")
+    })
 }
 
 pub(crate) fn threads(text: &str) -> Result<usize, String> {
-    within(text, 1024).map(|count| count as usize)
+    options::whole(1, options::THREADS_MAX)(text)
 }
 
 pub(crate) fn actors(text: &str) -> Result<usize, String> {
-    within(text, 256).map(|count| count as usize)
+    options::whole(1, 256)(text)
 }
 
 /// Parses a count.
 pub fn count(text: &str) -> Result<u32, String> {
-    within(text, 1_000_000)
-}
-
-fn within(text: &str, most: u32) -> Result<u32, String> {
-    let number = text.parse().ok().filter(|number| (1..=most).contains(number));
-    number.ok_or_else(|| format!("use a number from 1 to {most}"))
+    options::whole(1, 1_000_000)(text)
 }
 
 #[cfg(test)]
@@ -112,6 +117,6 @@ mod tests {
     fn names_are_those_of_the_configuration() {
         assert_eq!(named::<ExecutorKind>("magex-literal"), Ok(ExecutorKind::MagexLiteral));
         let error = named::<ExecutorKind>("fast").unwrap_err();
-        assert!(error.contains("`fast`") && error.contains("`local`"), "{error}");
+        assert!(error.contains("'fast'") && error.contains("local"), "{error}");
     }
 }

@@ -51,8 +51,7 @@ impl Token {
     }
 
     fn load(path: &Path) -> Result<MetadataValue<Ascii>, Failure> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Failure::usage(format!("--token-file {}: {error}", path.display())))?;
+        let text = crate::options::text_file("--token-file", path)?;
         Self::parse(&text, &format!("--token-file {}", path.display()))
     }
 
@@ -113,6 +112,15 @@ impl Settings {
             Some(Source::new("the token", files, move || token.reload()))
         });
         tls.into_iter().chain(token).collect()
+    }
+
+    /// Whether calls could be made to the address that an option gave; nothing is connected.
+    ///
+    /// # Errors
+    /// Wrong usage; the error names the option.
+    pub fn check(&self, option: &str, url: &str) -> Result<(), Failure> {
+        let checked = self.endpoint(url);
+        checked.map(drop).map_err(|error| Failure::new(error.code, format!("{option}: {error}")))
     }
 
     fn endpoint(&self, url: &str) -> Result<(Endpoint, Bearer), Failure> {

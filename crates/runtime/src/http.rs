@@ -28,7 +28,7 @@ const CONNECTIONS: ConnectionLimits =
 /// The option of every service with an HTTP server.
 #[derive(Debug, Clone, Default, clap::Args, serde::Serialize)]
 pub struct HttpArgs {
-    /// Address for operators: /metrics for Prometheus, and a learner's live page at /, over plain HTTP; port 0 is any free one [default: none]
+    /// Address for operators: /metrics for Prometheus and /healthz, over plain HTTP; port 0 is any free one [default: none]
     #[arg(long, env = "MAGEX_HTTP", value_name = "HOST:PORT")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub http: Option<String>,

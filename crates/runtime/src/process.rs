@@ -1,5 +1,7 @@
 //! The process itself: its environment, its limits and its one line of standard output.
 
+use crate::log_line::timestamp;
+use std::ffi::OsString;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt as _;
@@ -20,14 +22,23 @@ const ENVIRONMENT: [(&str, &str); 4] = [
 /// 200 actors needs a third less memory and is no slower.
 const ARENAS: &str = "MALLOC_ARENA_MAX";
 
+/// Variables that mean nothing when they are empty: a composition passes on what is not set as an empty text.
+const OPTIONAL: [&str; 2] = ["RUST_LOG", "NO_COLOR"];
+/// What the names of more of them begin with.
+const OPTIONAL_PREFIXES: [&str; 2] = ["MAGEX_", "OTEL_"];
+
 /// Re-executes this program with the environment that it needs (single-threaded tensor kernels, an allocator that keeps its
-/// buffers), unless all variables are set; those that are set are not changed. `main` calls this before it starts a thread. A
-/// debugger or `strace` sees the `exec`; to avoid it, set the variables. [`log_environment`] logs them once logging is set up.
+/// buffers, no empty variables), unless it has that already; variables that are set are not changed. `main` calls this before it
+/// starts a thread. A debugger or `strace` sees the `exec`; to avoid it, set the variables. [`log_environment`] logs them once
+/// logging is set up.
 pub fn ensure_environment() -> std::io::Result<()> {
     let arenas = processors().to_string();
     let needed = ENVIRONMENT.into_iter().chain([(ARENAS, arenas.as_str())]);
-    let mut missing = needed.filter(|(name, _)| std::env::var_os(name).is_none()).peekable();
-    if missing.peek().is_none() {
+    let mut missing = needed.filter(|(name, _)| std::env::var_os(name).is_none_or(|value| value.is_empty())).peekable();
+    let empty: Vec<OsString> =
+        std::env::vars_os().filter_map(|(name, value)| value.is_empty().then_some(name)).collect();
+    let mut unset = empty.iter().filter(|name| is_optional(&name.to_string_lossy())).peekable();
+    if missing.peek().is_none() && unset.peek().is_none() {
         return Ok(());
     }
     let mut command = Command::new(std::env::current_exe()?);
@@ -36,7 +47,14 @@ pub fn ensure_environment() -> std::io::Result<()> {
         // The program's behaviour may depend on the name it was called by.
         command.arg0(name);
     }
+    unset.for_each(|name| {
+        command.env_remove(name);
+    });
     Err(command.args(arguments).envs(missing).exec())
+}
+
+fn is_optional(name: &str) -> bool {
+    OPTIONAL.contains(&name) || OPTIONAL_PREFIXES.iter().any(|prefix| name.starts_with(prefix))
 }
 
 /// Logs, at debug level, the variables for which [`ensure_environment`] re-executes the program.
@@ -48,13 +66,13 @@ pub fn log_environment() {
 }
 
 /// The line that reports to a supervisor where a service listens: `{"ready":true,"service":"learner","address":"127.0.0.1:7000"}`,
-/// with `"http"`, the address of its metrics, as a last key if there is one.
-fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) -> String {
+/// with `"http"`, the address of its metrics, if there is one, and `"timestamp"`, so that it finds its place among log lines.
+fn ready_line(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>, timestamp: &str) -> String {
     let json = |address: SocketAddr| serde_json::Value::from(address.to_string());
     let http = http.map_or_else(String::new, |http| format!(",\"http\":{}", json(http)));
     // Written out so that the order of the keys is the documented one.
     format!(
-        "{{\"ready\":true,\"service\":{},\"address\":{}{http}}}",
+        "{{\"ready\":true,\"service\":{},\"address\":{}{http},\"timestamp\":\"{timestamp}\"}}",
         serde_json::Value::from(service),
         address.map_or(serde_json::Value::Null, json)
     )
@@ -111,7 +129,7 @@ pub fn print(text: &str) {
 pub fn announce_ready(service: &str, address: Option<SocketAddr>, http: Option<SocketAddr>) {
     let mut stdout = std::io::stdout().lock();
     // A closed pipe is not an error.
-    let _ = writeln!(stdout, "{}", ready_line(service, address, http)).and_then(|()| stdout.flush());
+    let _ = writeln!(stdout, "{}", ready_line(service, address, http, &timestamp())).and_then(|()| stdout.flush());
 }
 
 #[cfg(test)]
@@ -121,10 +139,9 @@ mod tests {
     #[test]
     fn the_ready_line_is_json() {
         let at = |port: u16| Some(([127, 0, 0, 1], port).into());
-        let line = ready_line("learner", at(12345), None);
-        assert_eq!(line, r#"{"ready":true,"service":"learner","address":"127.0.0.1:12345"}"#);
-        assert_eq!(ready_line("actor", None, None), r#"{"ready":true,"service":"actor","address":null}"#);
-        let line = ready_line("actor", None, at(9102));
-        assert_eq!(line, r#"{"ready":true,"service":"actor","address":null,"http":"127.0.0.1:9102"}"#);
+        let line = ready_line("learner", at(12345), None, "T");
+        assert_eq!(line, r#"{"ready":true,"service":"learner","address":"127.0.0.1:12345","timestamp":"T"}"#);
+        let line = ready_line("actor", None, at(9102), "T");
+        assert_eq!(line, r#"{"ready":true,"service":"actor","address":null,"http":"127.0.0.1:9102","timestamp":"T"}"#);
     }
 }

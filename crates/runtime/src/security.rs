@@ -4,6 +4,7 @@ use crate::client::{Settings, Token};
 use crate::exit::Failure;
 use crate::net::auth::{Access, NEEDS_CLIENT_CA};
 use crate::net::connections::ConnectionLimits;
+use crate::options;
 use crate::reload::Source;
 use crate::server;
 use crate::tls::{ClientTls, ServerTls};
@@ -56,16 +57,16 @@ pub struct ServerArgs {
     #[arg(long, env = "MAGEX_IDENTITIES", value_name = "FILE", help_heading = "Security")]
     pub identities: Option<PathBuf>,
     /// Allow a non-loopback address without TLS or without authentication, and allow sending a token without TLS
-    #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
+    #[arg(long, env = "MAGEX_INSECURE", value_parser = options::switch, help_heading = "Security")]
     pub insecure: bool,
     /// Maximum number of connections
-    #[arg(long, default_value_t = 2048, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 2048, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub max_connections: u32,
     /// Maximum number of connections from one IP address
-    #[arg(long, default_value_t = 1024, value_name = "K", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Limits")]
+    #[arg(long, default_value_t = 1024, value_name = "K", value_parser = options::whole::<u32>(1, 1_000_000), help_heading = "Limits")]
     pub connections_per_peer: u32,
     /// Seconds between heartbeats on server streams, so that balancers keep quiet ones open; 0 for none
-    #[arg(long, env = "MAGEX_HEARTBEAT", default_value_t = 30, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(..=3600), help_heading = "Limits")]
+    #[arg(long, env = "MAGEX_HEARTBEAT", default_value_t = 30, value_name = "SECONDS", value_parser = options::whole::<u32>(0, 3600), help_heading = "Limits")]
     pub heartbeat: u32,
 }
 
@@ -156,13 +157,18 @@ pub struct CallerArgs {
     #[arg(long, env = "MAGEX_TLS_KEY", value_name = "FILE", requires = "tls_cert", help_heading = "Security")]
     pub tls_key: Option<PathBuf>,
     /// Allow sending the token without TLS to other machines
-    #[arg(long, env = "MAGEX_INSECURE", help_heading = "Security")]
+    #[arg(long, env = "MAGEX_INSECURE", value_parser = options::switch, help_heading = "Security")]
     pub insecure: bool,
 }
 
 impl CallerArgs {
     /// As [`ClientArgs::read`].
     pub fn read(&self) -> Result<Settings, Failure> {
+        if self.tls_cert.is_some() && self.client.tls_ca.is_none() {
+            return Err(Failure::usage(
+                "--tls-cert: a client's certificate needs --tls-ca, the CA of the services that see it",
+            ));
+        }
         self.client.read(self.tls_cert.as_deref().zip(self.tls_key.as_deref()), self.insecure)
     }
 }

@@ -33,7 +33,7 @@ pub async fn bind(listen: &str) -> Result<(Incoming, SocketAddr), Failure> {
 /// Listens on the address that an option gave.
 pub(crate) async fn listener(listen: &str, option: &str) -> Result<(TcpListener, SocketAddr), Failure> {
     let unavailable = |problem: String| Failure::new(exit::UNAVAILABLE, problem);
-    let wanted = resolve_for(listen, option).map_err(unavailable)?;
+    let wanted = resolve_for(listen, option).map_err(Failure::usage)?;
     let failed = |error: Error| {
         unavailable(match error.kind() {
             ErrorKind::AddrInUse => {
@@ -67,7 +67,7 @@ pub fn resolve(listen: &str) -> Result<SocketAddr, Failure> {
 fn resolve_for(listen: &str, option: &str) -> Result<SocketAddr, String> {
     listen.to_socket_addrs().ok().and_then(|mut addresses| addresses.next()).ok_or_else(|| {
         format!(
-            "'{listen}' is not an address to listen on: use the form host:port, for example {option} 127.0.0.1:7000"
+            "{option}: '{listen}' is not an address to listen on; use the form host:port, for example 127.0.0.1:7000"
         )
     })
 }

@@ -31,7 +31,7 @@ pub struct ServiceArgs {
     #[serde(flatten)]
     pub traces: TraceArgs,
     /// Format of log lines
-    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, default_value_t)]
+    #[arg(long, env = "MAGEX_LOG_FORMAT", value_enum, ignore_case = true, value_name = "FORMAT", default_value_t)]
     #[serde(skip)]
     pub log_format: LogFormat,
     /// Print the configuration in effect and exit

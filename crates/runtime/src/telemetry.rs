@@ -2,6 +2,8 @@
 
 use crate::client;
 use crate::exit::Failure;
+use crate::log_line;
+pub use crate::log_line::{is_json, line};
 use crate::trace;
 use opentelemetry::KeyValue;
 use opentelemetry::trace::TracerProvider as _;
@@ -35,6 +37,15 @@ pub enum LogFormat {
     Text,
     /// One JSON object per line.
     Json,
+}
+
+impl LogFormat {
+    /// Decides how this process writes to standard error, the message of a panic included.
+    pub fn apply(self) {
+        if self == Self::Json {
+            log_line::write_json();
+        }
+    }
 }
 
 /// The option of every service that can be traced.
@@ -77,8 +88,9 @@ pub fn init(service: &str, format: LogFormat, args: &TraceArgs) -> Result<Teleme
             .with_tracked_inactivity(false)
             .with_filter(filter_fn(is_traced))
     });
+    format.apply();
     // A second call changes nothing.
-    let _ = tracing_subscriber::registry().with(logs(format)).with(spans).try_init();
+    let _ = tracing_subscriber::registry().with(logs(format, filter("info")?)).with(spans).try_init();
     Ok(Telemetry { traces })
 }
 
@@ -86,8 +98,21 @@ fn is_traced(metadata: &Metadata<'_>) -> bool {
     metadata.target() == trace::TARGET
 }
 
-fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat) -> impl Layer<S> {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+/// What is logged: what RUST_LOG says, or `default`.
+///
+/// # Errors
+/// RUST_LOG is wrong.
+pub fn filter(default: &str) -> Result<EnvFilter, Failure> {
+    let Some(wanted) = std::env::var_os(EnvFilter::DEFAULT_ENV) else { return Ok(EnvFilter::new(default)) };
+    let wanted = wanted.to_string_lossy();
+    EnvFilter::try_new(&*wanted).map_err(|_| {
+        Failure::usage(format!(
+            "RUST_LOG: '{wanted}' is no list of filters; write for example info, or info,magex_learner=debug"
+        ))
+    })
+}
+
+fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat, filter: EnvFilter) -> impl Layer<S> {
     // An error would be printed where it occurred, and a thread that cannot print panics: a closed terminal, a full disk.
     let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).log_internal_errors(false);
     let lines = match format {

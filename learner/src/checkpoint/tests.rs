@@ -191,7 +191,7 @@ fn when_all_are_damaged_the_newest_is_named() {
         std::fs::write(folder.join("weights.safetensors"), b"x").unwrap();
     }
     let error = read_latest(run.path(), &state).unwrap_err().to_string();
-    assert!(error.contains("none of 2 checkpoints") && error.contains("000002/weights.safetensors"), "{error}");
+    assert!(error.contains("none of the 2 checkpoints") && error.contains("000002/weights.safetensors"), "{error}");
 }
 
 #[test]

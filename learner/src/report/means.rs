@@ -1,7 +1,7 @@
 //! Means of the episodes' metrics, and the fields that metrics.jsonl and summary.json have for them: one for each row of
 //! [`METRICS`], in its order.
 
-use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
+use magex_core::metrics_table::{METRICS, SUCCESS_RATE, as_written};
 use magex_core::trajectory::EpisodeMetrics;
 use serde::ser::SerializeMap as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -26,7 +26,7 @@ impl Serialize for EvalSummary {
         let mut map = serializer.serialize_map(None)?;
         map.serialize_entry("episodes", &self.episodes)?;
         for (metric, mean) in METRICS.iter().zip(self.means) {
-            map.serialize_entry(metric.name, &mean)?;
+            map.serialize_entry(metric.name, &mean.map(as_written))?;
         }
         map.end()
     }
@@ -54,7 +54,7 @@ impl IterationMeans {
     /// A row of [`METRICS`] as metrics.jsonl has it under its name: greedy, unless only its sampled column is there.
     pub fn get(&self, metric: usize) -> Option<f64> {
         let source = if METRICS[metric].greedy() { &self.greedy } else { &self.sampled };
-        source.and_then(|summary| summary.means[metric])
+        source.and_then(|summary| summary.means[metric]).map(as_written)
     }
 }
 
@@ -62,7 +62,7 @@ impl IterationMeans {
 impl Serialize for IterationMeans {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let greedy = METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy());
-        let sampled = |row: usize| self.sampled.and_then(|summary| summary.means[row]);
+        let sampled = |row: usize| self.sampled.and_then(|summary| summary.means[row]).map(as_written);
         let sampled = METRICS.iter().enumerate().filter_map(|(row, metric)| Some((metric.sampled?, sampled(row))));
         serializer.collect_map(greedy.map(|(row, metric)| (metric.name, self.get(row))).chain(sampled))
     }
@@ -83,9 +83,9 @@ impl Serialize for ClosingMeans {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
         for (row, metric) in METRICS.iter().enumerate().filter(|(_, metric)| metric.greedy()) {
-            map.serialize_entry(metric.name, &self.greedy[row])?;
+            map.serialize_entry(metric.name, &self.greedy[row].map(as_written))?;
             if row == SUCCESS_RATE {
-                map.serialize_entry(SAMPLED_SUCCESS_RATE, &self.sampled_success_rate)?;
+                map.serialize_entry(SAMPLED_SUCCESS_RATE, &self.sampled_success_rate.map(as_written))?;
             }
         }
         map.end()
@@ -124,6 +124,12 @@ mod tests {
             \"sampled_collision_rate\":null,\"sampled_cost_ratio\":null,\"reward\":null";
         let line = serde_json::to_string(&IterationMeans { greedy: Some(summary), sampled: None }).unwrap();
         assert_eq!(line, format!("{{{greedy},{sampled}}}"));
+        // Means of single-precision numbers print as such, as text and as a value.
+        let thirds: Vec<EpisodeMetrics> = [0.6, 0.6, 0.87].map(|x: f32| EpisodeMetrics([x; METRICS.len()])).to_vec();
+        let summary = summarise(&thirds).unwrap();
+        assert_eq!(serde_json::to_value(summary).unwrap()["success_rate"].to_string(), "0.69");
+        assert_eq!(IterationMeans { greedy: Some(summary), sampled: None }.get(SUCCESS_RATE), Some(0.69));
+        let summary = summarise([&first, &episode]).unwrap();
         let mut closing = ClosingMeans { greedy: summary.means, sampled_success_rate: Some(0.125) };
         let line = serde_json::to_string(&closing).unwrap();
         assert_eq!(line, format!("{{{}}}", greedy.replacen(",", ",\"sampled_success_rate\":0.125,", 1)));

@@ -1,6 +1,8 @@
 //! The configuration as it is written: TOML in which nearly every key may be missing.
 
-use super::{CollectConfig, ConfigError, RunConfig};
+use super::{
+    CollectConfig, CommanderConfig, ConfigError, EPISODES_MAX, ExecutorConfig, MappoConfig, RunConfig, RunSection,
+};
 use crate::error::FieldError;
 use crate::task::{self, NOT_ZERO};
 use crate::toml_table;
@@ -48,20 +50,24 @@ impl Default for RawCollect {
     }
 }
 
+fn collect_bounds(_key: &str) -> Option<String> {
+    Some(format!("1 to {EPISODES_MAX}"))
+}
+
 /// The configuration of a file; missing values are defaults or derived from others. Ranges are not checked.
 pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
-    let file: Table = toml::from_str(text).map_err(|e| ConfigError(e.to_string().trim().to_owned()))?;
+    let file: Table = toml::from_str(text).map_err(|error| not_toml(text, &error))?;
     refuse_renamed(&file)?;
-    let sections: Sections = toml_table::read("", file)?;
+    let sections: Sections = toml_table::read("", file, |_| None)?;
     let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
-    let collect: RawCollect = toml_table::read("collect", sections.collect)?;
+    let collect: RawCollect = toml_table::read("collect", sections.collect, collect_bounds)?;
     let mut config = RunConfig {
-        run: toml_table::read("run", sections.run)?,
+        run: toml_table::read("run", sections.run, RunSection::bounds)?,
         task,
-        executor: toml_table::read("executor", sections.executor)?,
-        commander: toml_table::read("commander", sections.commander)?,
+        executor: toml_table::read("executor", sections.executor, ExecutorConfig::bounds)?,
+        commander: toml_table::read("commander", sections.commander, CommanderConfig::bounds)?,
         collect: CollectConfig { episodes_per_iteration: 0, shards_per_iteration: collect.shards_per_iteration },
-        mappo: toml_table::read("mappo", sections.mappo)?,
+        mappo: toml_table::read("mappo", sections.mappo, MappoConfig::bounds)?,
     };
     config.collect.episodes_per_iteration = match collect.episodes_per_iteration {
         Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO).into()),
@@ -69,6 +75,22 @@ pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
         None => config.derived_episodes(),
     };
     Ok(config)
+}
+
+/// Where a text is no TOML. The parser's words are kept where they speak of TOML.
+fn not_toml(text: &str, error: &toml::de::Error) -> ConfigError {
+    let problem = match error.message().trim() {
+        message if ["too large", "too small", "overflow"].iter().any(|words| message.contains(words)) => {
+            "this whole number is out of range; write one from -9223372036854775808 to 9223372036854775807"
+        }
+        message => message,
+    };
+    let place = error.span().map(|span| {
+        let before = text.get(..span.start).unwrap_or(text);
+        let line = before.matches('\n').count();
+        format!("line {} (`{}`): ", line + 1, text.lines().nth(line).unwrap_or_default().trim())
+    });
+    ConfigError(format!("{}{problem}", place.unwrap_or_default()))
 }
 
 fn refuse_renamed(file: &Table) -> Result<(), FieldError> {

@@ -81,7 +81,7 @@ pub(super) const DEFINITION: Definition = Definition {
     horizon: |_, _| 120,
     layout_scale: |_| 1.0,
     default_settings: |_| TaskSettings::Drones(DroneConfig::default()),
-    read_settings: |_, section| toml_table::read("task.drones", section).map(TaskSettings::Drones),
+    read_settings: |_, section| toml_table::read("task.drones", section, DroneConfig::bounds).map(TaskSettings::Drones),
     validate,
 };
 

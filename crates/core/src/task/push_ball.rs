@@ -70,7 +70,9 @@ pub(super) const DEFINITION: Definition = Definition {
     },
     layout_scale: |_| 0.5,
     default_settings: |_| TaskSettings::PushBall(PushBallConfig::default()),
-    read_settings: |_, section| toml_table::read("task.push_ball", section).map(TaskSettings::PushBall),
+    read_settings: |_, section| {
+        toml_table::read("task.push_ball", section, PushBallConfig::bounds).map(TaskSettings::PushBall)
+    },
     validate,
 };
 

@@ -54,7 +54,7 @@ pub(super) const DEFINITION: Definition = Definition {
     read_settings: |side, mut section| {
         let given = section.contains_key("distance_unit");
         section.entry("distance_unit").or_insert_with(|| f64::from(side).into());
-        let reward: RewardConfig = toml_table::read("task.reward", section)?;
+        let reward: RewardConfig = toml_table::read("task.reward", section, RewardConfig::bounds)?;
         if given && reward.distance_unit == 0.0 {
             return Err(FieldError::new("task.reward.distance_unit", super::NOT_ZERO));
         }

@@ -10,18 +10,19 @@ use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_proto::{COMMANDER, SERVICES};
 use magex_runtime::exit;
+use magex_runtime::options;
 use magex_runtime::peer::Remote;
 use magex_runtime::security::CallerArgs;
-use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::io::Read as _;
+use std::path::Path;
 use std::time::{Duration, Instant};
 use tonic::{Code, Status};
 
 const AFTER_HELP: &str = "\
 Examples:
   magex assign --agents '[[0,0],[1,0]]' --goals '[[1,1],[0,1]]'
-  magex assign --agents team.json --scheduler exact
+  magex assign --agents team.json --scheduler learned
   generate-team | magex assign --agents - --json
   magex assign --connect http://10.0.0.2:7100 --random 50 --seed 7
 
@@ -49,16 +50,16 @@ pub(crate) struct AssignArgs {
     #[arg(long, value_name = "FILE|JSON", conflicts_with = "random")]
     pub(crate) goals: Option<String>,
     /// Use a random team of N agents and N goals, uniform in a square with the density of the task.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=5000))]
+    #[arg(long, value_name = "N", value_parser = options::whole::<u32>(1, 5000))]
     pub(crate) random: Option<u32>,
     /// Assignment method.
-    #[arg(long, value_enum, value_name = "KIND", default_value = "learned")]
+    #[arg(long, value_enum, value_name = "KIND", default_value = "exact")]
     pub(crate) scheduler: Kind,
     /// How the goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
     pub(crate) mode: Choice,
     /// Seed of random choices.
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", value_parser = options::whole::<u64>(0, u64::MAX))]
     pub(crate) seed: Option<u64>,
 }
 
@@ -86,8 +87,7 @@ pub(crate) enum Choice {
     Sampled = v1::Mode::Sampled as isize,
 }
 
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq)]
 struct Team {
     agents: Vec<Vec<f32>>,
     goals: Vec<Vec<f32>>,
@@ -205,30 +205,56 @@ fn team(args: &AssignArgs) -> anyhow::Result<Team> {
         return Ok(Team { agents: (0..n).map(&mut point).collect(), goals: (0..n).map(&mut point).collect() });
     }
     let agents = read("agents", args.agents.as_deref().unwrap_or_default())?;
-    let Some(goals) = &args.goals else {
-        return serde_json::from_str(&agents).map_err(|error| {
-            usage(format!(
-                "--agents: {error}; give {{\"agents\": [[x, y], …], \"goals\": [[x, y], …]}}, or add --goals"
-            ))
-        });
+    let agents = parse("agents", &agents)?;
+    if let Some(goals) = &args.goals {
+        let goals = parse("goals", &read("goals", goals)?)?;
+        return Ok(Team { agents: points("--agents", &agents)?, goals: points("--goals", &goals)? });
+    }
+    let form = "give {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}, or add --goals";
+    let Value::Object(team) = agents else { return Err(usage(format!("--agents: there are no goals; {form}"))) };
+    if let Some(key) = team.keys().find(|key| !["agents", "goals"].contains(&key.as_str())) {
+        return Err(usage(format!("--agents: unknown key '{key}'; {form}")));
+    }
+    let side = |key: &str| {
+        let list = team.get(key).ok_or_else(|| usage(format!("--agents: '{key}' is missing; {form}")))?;
+        points(&format!("--agents: {key}"), list)
     };
-    let points = |field: &str, text: &str| {
-        serde_json::from_str::<Vec<Vec<f32>>>(text)
-            .map_err(|error| usage(format!("--{field}: {error}; give [[x, y], …]")))
+    Ok(Team { agents: side("agents")?, goals: side("goals")? })
+}
+
+fn parse(field: &str, text: &str) -> anyhow::Result<Value> {
+    serde_json::from_str(text).map_err(|error| {
+        let (line, column) = (error.line(), error.column());
+        usage(format!("--{field}: not valid JSON at line {line}, column {column}; give [[x, y], …]"))
+    })
+}
+
+/// The points of a list; an error names the one that is wrong.
+fn points(field: &str, list: &Value) -> anyhow::Result<Vec<Vec<f32>>> {
+    let wrong = |place: String, what: &str, value: &Value| usage(format!("{field}{place}: {value} is not {what}"));
+    let list = list.as_array().ok_or_else(|| wrong(String::new(), "a list of points; give [[x, y], …]", list))?;
+    let point = |(i, point): (usize, &Value)| {
+        let numbers = point.as_array().ok_or_else(|| wrong(format!("[{i}]"), "a point; give [x, y]", point))?;
+        let number = |(k, value): (usize, &Value)| {
+            let number = value.as_f64().map(|number| number as f32).filter(|number| number.is_finite());
+            number.ok_or_else(|| wrong(format!("[{i}][{k}]"), "a number up to 3.4e38", value))
+        };
+        numbers.iter().enumerate().map(number).collect()
     };
-    Ok(Team { agents: points("agents", &agents)?, goals: points("goals", &read("goals", goals)?)? })
+    list.iter().enumerate().map(point).collect()
 }
 
 /// JSON as it is, a file's contents, or standard input.
 fn read(field: &str, text: &str) -> anyhow::Result<String> {
     match text {
         "-" => {
-            let mut all = String::new();
-            std::io::stdin().read_to_string(&mut all).context("standard input")?;
-            Ok(all)
+            let mut all = Vec::new();
+            std::io::stdin().read_to_end(&mut all).context("standard input")?;
+            String::from_utf8(all).map_err(|_| usage(format!("--{field} -: standard input is not text (UTF-8)")))
         }
         _ if text.trim_start().starts_with(['[', '{']) => Ok(text.to_owned()),
-        path => std::fs::read_to_string(path).map_err(|error| usage(format!("--{field} {path}: {error}"))),
+        "" => Err(usage(format!("--{field}: nothing is given; give JSON or a file"))),
+        path => Ok(options::text_file(&format!("--{field}"), Path::new(path))?),
     }
 }
 

@@ -1,9 +1,8 @@
 //! `magex bench`: a pointer to the program that measures.
 
 use crate::options::CommonOptions;
-use crate::output::note;
+use crate::output::fatal;
 use magex_runtime::exit;
-use serde_json::json;
 
 const AFTER_HELP: &str = "\
 Examples:
@@ -23,7 +22,6 @@ pub(crate) struct BenchArgs {
 pub(crate) fn run(args: &BenchArgs, options: &CommonOptions) -> u8 {
     let args = if args.args.is_empty() { "--help".to_owned() } else { args.args.join(" ") };
     let message = format!("benchmarks live in their own program: cargo run --release -p magex-bench -- {args}");
-    note(&message);
-    options.output().result(&json!({ "error": message, "exit_code": exit::USAGE }));
+    fatal(&message, exit::USAGE, options.json);
     exit::USAGE
 }

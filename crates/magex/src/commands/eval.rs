@@ -6,12 +6,14 @@ use crate::failure::usage;
 use crate::options::CommonOptions;
 use crate::output::{Table, note, seconds};
 use crate::settings;
+use magex_core::config::SEED_MAX;
 use magex_core::ids::Mode;
 use magex_core::metrics_table::METRICS;
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::means::{EvalSummary, summarise};
 use magex_runtime::exit;
+use magex_runtime::options;
 use magex_runtime::process::processors;
 use serde::Serialize;
 use serde_json::{Map, json};
@@ -44,7 +46,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_name = "K", default_value_t = 100, value_parser = settings::count)]
     episodes: u32,
     /// Seeds of the episodes, one row per seed and mode [default: the seed of the run].
-    #[arg(long, value_name = "S,…", value_delimiter = ',')]
+    #[arg(long, value_name = "S,…", value_delimiter = ',', value_parser = options::whole::<u64>(0, SEED_MAX))]
     episode_seeds: Vec<u64>,
     /// The former name of --episode-seeds.
     #[arg(long, value_name = "S,…", hide = true, value_parser = renamed)]

@@ -3,6 +3,7 @@
 use crate::options::CommonOptions;
 use magex_runtime::exit;
 use magex_runtime::health::probe;
+use magex_runtime::options;
 use serde_json::json;
 use std::time::Duration;
 
@@ -30,7 +31,7 @@ pub(crate) struct HealthArgs {
     #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
     service: String,
     /// Seconds for connection and response.
-    #[arg(long, value_name = "SECONDS", default_value_t = probe::DEADLINE.as_secs() as u32, value_parser = clap::value_parser!(u32).range(1..=3600))]
+    #[arg(long, value_name = "SECONDS", default_value_t = probe::DEADLINE.as_secs() as u32, value_parser = options::whole::<u32>(1, 3600))]
     timeout: u32,
 }
 

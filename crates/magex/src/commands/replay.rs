@@ -5,6 +5,7 @@ use crate::evaluate::{Controller, Episodes, Modes, Subject, mode_name, roll_out}
 use crate::options::CommonOptions;
 use crate::output::note;
 use magex_runtime::exit;
+use magex_runtime::options;
 use magex_runtime::process::processors;
 use serde_json::json;
 use std::path::PathBuf;
@@ -29,7 +30,7 @@ pub(crate) struct ReplayArgs {
     #[arg(long, short, value_name = "FILE.html")]
     out: Option<PathBuf>,
     /// Episodes on the page.
-    #[arg(long, value_name = "K", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=100))]
+    #[arg(long, value_name = "K", default_value_t = 4, value_parser = options::whole::<u32>(1, 100))]
     episodes: u32,
     /// How actions and goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]

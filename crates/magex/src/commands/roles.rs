@@ -24,6 +24,9 @@ Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or
 configuration, 69 the port is in use, 73 --out exists, cannot be written or is
 written by another process, 75 stopped before the end (--resume continues), 130 interrupted twice";
 
+const LEARNER_HTTP: &str = "Address for operators: the live page at /, /metrics for Prometheus and /healthz, over plain HTTP; \
+    port 0 is any free one [default: none]";
+
 const ACTOR_HELP: &str = "\
 Examples:
   magex actor --learner http://10.0.0.1:7000 --commander http://10.0.0.2:7100
@@ -62,7 +65,7 @@ pub(crate) fn by_name(arguments: impl Iterator<Item = OsString>) -> Vec<OsString
 
 /// Run the learner alone: leases shards to actors, trains, broadcasts weights.
 #[derive(Debug, Clone, clap::Args)]
-#[command(after_help = LEARNER_HELP)]
+#[command(after_help = LEARNER_HELP, mut_arg("http", |http| http.help(LEARNER_HTTP)))]
 pub(crate) struct LearnerRole {
     #[command(flatten)]
     args: LearnerArgs,

@@ -33,7 +33,7 @@ const AFTER_HELP: &str = "\
 Examples:
   magex train                              the default run: 50 agents, two actors
   magex train --executor local --seed 2    the small network, another seed
-  magex train my.toml --out runs/mine      a configuration of your own
+  magex train my.toml --name mine          a configuration of your own, in runs/mine
   magex train --resume --out runs/mine     continue after Ctrl-C or a crash
   magex train --resume --out runs/mine --max-steps 50000    train on
   magex train new.toml --from runs/mine    begin from the weights of a run
@@ -70,9 +70,12 @@ pub(crate) struct TrainArgs {
     /// Run folder [default: runs/<task>-<N>-<executor>-s<seed>, with -2, -3, … if it exists].
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Continue the run in --out from its newest usable checkpoint; keys of [run] may change (budget, target, evaluations,
-    /// checkpoints).
-    #[arg(long, requires = "out")]
+    /// Name of the run: its folder is runs/NAME.
+    #[arg(long, value_name = "NAME", conflicts_with = "out", value_parser = folder::name)]
+    name: Option<String>,
+    /// Continue the run in --out (or with --name) from its newest usable checkpoint; keys of [run] may change (budget, target,
+    /// evaluations, checkpoints).
+    #[arg(long)]
     resume: bool,
     /// Begin from the weights of another run: its newest checkpoint. Team size, rewards and step sizes may differ; without a
     /// configuration file, that run's configuration is used.
@@ -100,14 +103,29 @@ pub(crate) struct TrainArgs {
     overrides: Overrides,
 }
 
+impl TrainArgs {
+    /// The same options with the folder that the run's name stands for. A run that continues needs one.
+    fn with_folder(&self) -> anyhow::Result<Self> {
+        let named = self.name.as_ref().map(|name| Path::new(folder::RUNS).join(name));
+        let out = self.out.clone().or(named);
+        if self.resume && out.is_none() {
+            let newest = folder::newest().map(|folder| format!(" {}, the newest one", folder.display()));
+            let newest = newest.unwrap_or_else(|| " FOLDER".to_owned());
+            return Err(usage(format!("--resume: which run? add --out{newest}")));
+        }
+        Ok(Self { out, ..self.clone() })
+    }
+}
+
 /// Reads the configuration, prepares the run folder, trains, and reports the result.
 pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let (started, output) = (Instant::now(), options.output());
+    let args = &args.with_folder()?;
 
     let (config, parent) = read(args)?;
     if args.print_config {
         output.say(config.to_toml()?.trim_end());
-        output.result(&serde_json::to_value(&config)?);
+        output.result(&as_json(&config)?);
         return Ok(exit::OK);
     }
 
@@ -162,6 +180,11 @@ fn read(args: &TrainArgs) -> anyhow::Result<(RunConfig, Option<Parent>)> {
         None => config,
     };
     Ok((config, parent))
+}
+
+/// By its text: single-precision numbers print as they are written.
+fn as_json(config: &RunConfig) -> anyhow::Result<Value> {
+    Ok(serde_json::from_str(&serde_json::to_string(config)?)?)
 }
 
 // --- Prepare ----------------------------------------------------------------------------------------------------------

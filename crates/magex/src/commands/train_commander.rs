@@ -11,7 +11,7 @@ use crate::parallel;
 use crate::settings;
 use crate::synthetic::Synthetic;
 use magex_assign::exact_points;
-use magex_core::config::{CommanderPolicy, RunConfig};
+use magex_core::config::{CommanderPolicy, RunConfig, SEED_MAX};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::sha256;
@@ -20,6 +20,7 @@ use magex_learner::run_folder::FolderError;
 use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
 use magex_learner::train::learned::Network;
 use magex_nets::params::to_safetensors;
+use magex_runtime::options;
 use magex_runtime::process::processors;
 use magex_runtime::{exit, shutdown};
 use serde_json::{Value, json};
@@ -53,13 +54,13 @@ pub(crate) struct TrainCommanderArgs {
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Seed of weights, instances and samples [run.seed].
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", value_parser = options::whole::<u64>(0, SEED_MAX))]
     seed: Option<u64>,
     /// Gradient steps of imitation.
-    #[arg(long, value_name = "K", default_value_t = 300)]
+    #[arg(long, value_name = "K", default_value_t = 300, value_parser = options::whole::<u32>(0, 1_000_000))]
     imitation: u32,
     /// Updates of PPO.
-    #[arg(long, value_name = "K", default_value_t = 200)]
+    #[arg(long, value_name = "K", default_value_t = 200, value_parser = options::whole::<u32>(0, 1_000_000))]
     ppo: u32,
     /// Synthetic instances per step or update.
     #[arg(long, value_name = "K", default_value_t = 64, value_parser = settings::count)]

@@ -155,13 +155,12 @@ impl Access {
 
 impl Identities {
     fn read(path: &Path) -> Result<Self, Failure> {
-        let text = std::fs::read_to_string(path).map_err(|error| error.to_string());
-        let identities = text.and_then(|text| Self::parse(&text));
-        identities.map_err(|problem| Failure::usage(format!("--identities {}: {problem}", path.display())))
+        Self::parse(&crate::options::text_file("--identities", path)?)
+            .map_err(|problem| Failure::usage(format!("--identities {}: {problem}", path.display())))
     }
 
     fn parse(text: &str) -> Result<Self, String> {
-        let file: File = toml::from_str(text).map_err(|error| error.to_string())?;
+        let file: File = toml::from_str(text).map_err(|error| crate::options::toml_problem(text, &error))?;
         if file.identity.is_empty() {
             return Err(
                 "identity: the file has no [[identity]] entry, so no caller could authenticate; add one".to_owned()
@@ -253,11 +252,11 @@ mod tests {
     fn invalid_files_are_rejected() {
         for (text, words) in [
             ("", "no [[identity]]"),
-            ("[[identity]]\nname = 'a'\nrole = 'king'", "unknown variant"),
+            ("[[identity]]\nname = 'a'\nrole = 'king'", "unknown name 'king'"),
             ("[[identity]]\nname = 'a'\nrole = 'client'", "identity[0]: give either"),
             ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = 'abc'", "64 hexadecimal"),
             ("[[identity]]\nname = ''\nrole = 'client'\ntoken_sha256 = 'abc'", "identity[0].name"),
-            ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken = 'abc'", "unknown field"),
+            ("[[identity]]\nname = 'a'\nrole = 'client'\ntoken = 'abc'", "unknown key"),
         ] {
             let error = Identities::parse(text).unwrap_err();
             assert!(error.contains(words), "{error}");
