@@ -29,11 +29,11 @@ Examples:
   magex eval RUN --spawn lines --per-layout        one row per layout
   magex eval weights.safetensors --config config.toml   a weights file
 
-success: share of landmarks with an agent within 0.15 at the end. matched: the
-same with one agent per landmark. all covered: share of episodes with every
-landmark covered. arrival: first step with 99 % covered. collisions: other
-agents in contact, per agent and step. cost: summed distance to the goals over
-the minimum.
+success: share of landmarks with an agent within 0.15 at the end. matched: the \
+    same with one agent per landmark. all covered: share of episodes with every \
+    landmark covered. arrival: first step with 99 % covered. collisions: other \
+    agents in contact, per agent and step. cost: summed distance to the goals over \
+    the minimum.
 
 Exit codes: 0 success, 1 evaluation failed, 64 wrong usage or configuration";
 

@@ -35,16 +35,16 @@ Examples:
   magex train --in-process --json          one process; result as JSON
   magex train --http 127.0.0.1:8080        fixed port for the live page
 
-The run folder gets config.toml, metrics.jsonl, checkpoints/,
-weights.safetensors, summary.json, curve.svg, replay.html and tensorboard/.
-The address of the live page is printed at the start. The same configuration
-and seed give the same weights, in one process or with any number of actors.
-The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to
-resume; a second Ctrl-C stops at once.
+The run folder gets config.toml, metrics.jsonl, checkpoints/, \
+    weights.safetensors, summary.json, curve.svg, replay.html and tensorboard/. \
+    The address of the live page is printed at the start. The same configuration \
+    and seed give the same weights, in one process or with any number of actors. \
+    The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to \
+    resume; a second Ctrl-C stops at once.
 
-Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-73 --out exists or cannot be written, 75 stopped before the end (--resume
-continues), 130 interrupted twice";
+Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration, \
+    73 --out exists or cannot be written, 75 stopped before the end (--resume \
+    continues), 130 interrupted twice";
 
 /// Train a team and write a run folder.
 #[derive(Debug, Clone, clap::Args)]
