@@ -1,6 +1,6 @@
 //! Variables of the environment, and standard error in the JSON format, as a shell or a collector of logs sees them.
 
-#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 use magex_tests::sandbox::binary;
 use serde_json::Value;

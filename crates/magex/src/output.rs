@@ -21,11 +21,11 @@ impl Output {
     /// Prints text.
     pub fn say(&self, text: impl AsRef<str>) {
         let text = text.as_ref();
+        if self.json {
+            return telemetry::line("INFO", text, None);
+        }
         // A closed pipe is no error.
-        let _ = match self.json {
-            true => Ok(telemetry::line("INFO", text, None)),
-            false => writeln!(std::io::stdout().lock(), "{text}"),
-        };
+        let _ = writeln!(std::io::stdout().lock(), "{text}");
     }
 
     /// Prints the machine-readable result.

@@ -69,13 +69,10 @@ fn read(text: &str) -> Whole {
 }
 
 /// Parses decimal numbers in `low..=high`.
-pub fn number<T: FromStr + PartialOrd + Display + Copy>(
+pub fn number<T: FromStr + PartialOrd + Display + Copy + Send + Sync>(
     low: T,
     high: T,
-) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync
-where
-    T: Send + Sync,
-{
+) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync {
     move |text| {
         let wanted = format!("write a number from {low} to {high}");
         let text = text.trim();

@@ -26,12 +26,12 @@ Examples:
   generate-team | magex assign --agents - --json
   magex assign --connect http://10.0.0.2:7100 --random 50 --seed 7
 
-A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]} with two or
-three coordinates. With more agents than goals some agents get no goal, and
-vice versa. gap: excess of the summed distance over the minimum.
+A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]} with two or \
+    three coordinates. With more agents than goals some agents get no goal, and \
+    vice versa. gap: excess of the summed distance over the minimum.
 
-Exit codes: 0 success, 1 the commander rejected the request or failed, 64 wrong
-usage or positions, 69 the commander cannot be reached";
+Exit codes: 0 success, 1 the commander rejected the request or failed, 64 wrong \
+    usage or positions, 69 the commander cannot be reached";
 
 /// Request goal assignments from a running commander.
 #[derive(Debug, Clone, clap::Args)]

@@ -30,11 +30,11 @@ Examples:
   magex eval weights.safetensors --config config.toml   a weights file
   magex eval RUN --strict --json                   for scripts
 
-success: share of landmarks with an agent within 0.15 at the end. matched: the
-same with one agent per landmark. all covered: share of episodes with every
-landmark covered. arrival: first step with 99 % covered. collisions: other
-agents in contact, per agent and step. cost: summed distance to the goals over
-the minimum.
+success: share of landmarks with an agent within 0.15 at the end. matched: the \
+    same with one agent per landmark. all covered: share of episodes with every \
+    landmark covered. arrival: first step with 99 % covered. collisions: other \
+    agents in contact, per agent and step. cost: summed distance to the goals over \
+    the minimum.
 
 Exit codes: 0 success, 1 evaluation failed, 64 wrong usage or configuration";
 

@@ -13,9 +13,9 @@ Examples:
   magex health http://127.0.0.1:9102/healthz    HTTP, for actors
   magex health https://commander:7100 --timeout 5
 
-https uses MAGEX_TLS_CA, MAGEX_TLS_CERT and MAGEX_TLS_KEY. magex-learner,
-magex-commander and magex-actor check themselves with --health-check, at the
-address in their own options and environment.
+https uses MAGEX_TLS_CA, MAGEX_TLS_CERT and MAGEX_TLS_KEY. magex-learner, \
+    magex-commander and magex-actor check themselves with --health-check, at the \
+    address in their own options and environment.
 
 Exit codes: 0 serving, 1 not serving, 64 wrong usage, 69 no service answers
 there, or another one";

@@ -19,8 +19,8 @@ Examples:
 
 The page is one self-contained file: open it in any browser.
 
-Exit codes: 0 success, 1 rollout failed, 64 wrong usage or configuration,
-73 the file cannot be written";
+Exit codes: 0 success, 1 rollout failed, 64 wrong usage or configuration, \
+    73 the file cannot be written";
 
 /// Record evaluation episodes as an HTML page.
 #[derive(Debug, Clone, clap::Args)]

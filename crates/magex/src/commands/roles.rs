@@ -17,12 +17,12 @@ Examples:
   magex learner --out runs/mine --resume-or-create --stay    restart policy
   magex learner --config new.toml --from runs/mine --out runs/next
 
-Options can also be set in the environment; the command line takes precedence.
-Actors and commander may start before or after the learner.
+Options can also be set in the environment; the command line takes precedence. \
+    Actors and commander may start before or after the learner.
 
-Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or
-configuration, 69 the port is in use, 73 --out exists, cannot be written or is
-written by another process, 75 stopped before the end (--resume continues), 130 interrupted twice";
+Exit codes: 0 the run is complete, 1 training failed, 64 wrong usage or \
+    configuration, 69 the port is in use, 73 --out exists, cannot be written or is \
+    written by another process, 75 stopped before the end (--resume continues), 130 interrupted twice";
 
 const LEARNER_HTTP: &str = "Address for operators: the live page at /, /metrics for Prometheus and /healthz, over plain HTTP; \
     port 0 is any free one [default: none]";
@@ -33,11 +33,11 @@ Examples:
   magex actor --threads 4 --stay
   magex actor --learner https://10.0.0.1:7000 --tls-ca ca.pem --token-file token
 
-An actor waits until it can reach the learner. The number of actors does not
-change the results of the run.
+An actor waits until it can reach the learner. The number of actors does not \
+    change the results of the run.
 
-Exit codes: 0 the run is complete or the actor was stopped, 64 wrong usage,
-69 the learner rejected the actor, 130 interrupted twice";
+Exit codes: 0 the run is complete or the actor was stopped, 64 wrong usage, \
+    69 the learner rejected the actor, 130 interrupted twice";
 
 const COMMANDER_HELP: &str = "\
 Examples:
@@ -47,11 +47,11 @@ Examples:
   magex commander --listen 0.0.0.0:7100 --tls-cert server.pem \\
       --tls-key server.key --identities clients.toml
 
-Query it with magex assign, or over gRPC (reflection is on); see
-docs/commander.md.
+Query it with magex assign, or over gRPC (reflection is on); see \
+    docs/commander.md.
 
-Exit codes: 0 stopped, 64 wrong usage or weights, 69 the port is in use,
-70 internal error, 73 --data cannot be used, 130 interrupted twice";
+Exit codes: 0 stopped, 64 wrong usage or weights, 69 the port is in use, \
+    70 internal error, 73 --data cannot be used, 130 interrupted twice";
 
 /// Called through a link named `magex-learner`, this program behaves like `magex learner`; the same for the other services.
 pub(crate) fn by_name(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {

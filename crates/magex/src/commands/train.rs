@@ -40,19 +40,16 @@ Examples:
   magex train --in-process --json          one process; result as JSON
   magex train --http 127.0.0.1:8080        fixed port for the live page
 
-The run folder gets config.toml, metrics.jsonl, checkpoints/,
-weights.safetensors, summary.json, recordings.json, curve.svg, replay.html,
-tensorboard/, logs/ and .lock; README.md explains each.
-The address of the live page is printed at the start. The same configuration
-and seed give the same weights, in one process or with any number of actors.
-The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to
-resume; a second Ctrl-C, half a second later or more, stops at once. SIGTERM,
-SIGUSR1 and SIGHUP are like the first Ctrl-C.
+The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, recordings.json, \
+    curve.svg, replay.html, tensorboard/, logs/ and .lock; README.md explains each. \
+    The address of the live page is printed at the start. The same configuration and seed give the same weights, in one \
+    process or with any number of actors. The first Ctrl-C finishes the iteration, writes a checkpoint and prints how to \
+    resume; a second Ctrl-C, half a second later or more, stops at once. SIGTERM, SIGUSR1 and SIGHUP are like the first \
+    Ctrl-C.
 
-Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-69 the port of the page is in use, 73 --out exists, cannot be written or is
-written by another process, 75 stopped before the end (--resume continues),
-130 interrupted twice";
+Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration, 69 the port of the page is in use, \
+    73 --out exists, cannot be written or is written by another process, 75 stopped before the end (--resume continues), \
+    130 interrupted twice";
 
 /// Threads of this process besides those that train.
 const OWN_THREADS: usize = 4;

@@ -34,14 +34,13 @@ Examples:
   magex train-commander my.toml --ppo 0 --seed 2    imitation only
   magex commander --weights runs/scheduler          serves it
 
-The folder gets config.toml, metrics.jsonl, summary.json and
-weights.safetensors, which contains the commander alone: magex eval needs a run
-of magex train. The same options and seed give the same weights with any number
-of threads.
+The folder gets config.toml, metrics.jsonl, summary.json and \
+    weights.safetensors, which contains the commander alone: magex eval needs a run \
+    of magex train. The same options and seed give the same weights with any number \
+    of threads.
 
-Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration,
-73 --out exists or cannot be written, 75 stopped before the end (nothing is
-kept), 130 interrupted twice";
+Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration, \
+    73 --out exists or cannot be written, 75 stopped before the end (nothing is kept), 130 interrupted twice";
 
 /// Train the goal scheduler alone, on synthetic teams of 2 to 200 agents.
 #[derive(Debug, Clone, clap::Args)]

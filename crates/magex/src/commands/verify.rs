@@ -13,16 +13,16 @@ Examples:
   magex verify recordings/mpe-n50.json    one file
   magex verify DIR --json
 
-Recordings of the original particle simulator (mpe-golden-1: Simple Spread and
-Push Ball) and of the original drone simulator (drone-golden-1) are replayed
-step by step, the drones by the exact model and by the task's rigid-body
-engine. Calls of its controller (drone-controller-golden-1) and its forces
-(drone-forces-golden-1) are recomputed. Assignment problems
-(assignment-golden-1) are solved. Each file is listed with its worst difference
-and the largest difference that passes. Other JSON files are skipped.
+Recordings of the original particle simulator (mpe-golden-1: Simple Spread and \
+    Push Ball) and of the original drone simulator (drone-golden-1) are replayed \
+    step by step, the drones by the exact model and by the task's rigid-body \
+    engine. Calls of its controller (drone-controller-golden-1) and its forces \
+    (drone-forces-golden-1) are recomputed. Assignment problems \
+    (assignment-golden-1) are solved. Each file is listed with its worst difference \
+    and the largest difference that passes. Other JSON files are skipped.
 
-Exit codes: 0 everything agrees, 1 a recording disagrees or nothing could be
-checked, 64 no such folder";
+Exit codes: 0 everything agrees, 1 a recording disagrees or nothing could be \
+    checked, 64 no such folder";
 
 /// Check simulators, controller and solver against recordings of other programs.
 #[derive(Debug, Clone, clap::Args)]
