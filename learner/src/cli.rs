@@ -20,7 +20,6 @@ use magex_runtime::process;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
 use magex_viewer::page::{LivePage, RunInfo};
-use std::fmt::Display;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;

@@ -14,9 +14,10 @@ use magex_learner::trainer::TrainError;
 use magex_proto::v1;
 use magex_proto::v1::learner_service_client::LearnerServiceClient;
 use magex_runtime::{client, exit};
-use service::{Service, code_of, keep};
+use service::{Running, Service, code_of, keep};
 use std::os::fd::{AsFd as _, AsRawFd as _};
 use std::path::Path;
+use std::process::ExitStatus;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -99,7 +100,23 @@ pub(crate) async fn run(
     let url = format!("http://{}", running.address);
     let commander =
         |listen: &str| Service::new("commander", &["commander", "--learner", &url, "--listen", listen], logs);
-    let first = commander("127.0.0.1:0").start().await?;
+    let mut lives = LIVES;
+    // The commander is ready with the first weights: a learner that ends before (a complete run has no work) never sends any.
+    let unbound = commander("127.0.0.1:0");
+    let first = loop {
+        let status = tokio::select! {
+            started = unbound.start() => break started?,
+            status = running.wait() => status?,
+            () = interrupted.cancelled() => {
+                running.stop().await;
+                return Ok(TrainEnd::Stopped);
+            }
+        };
+        if let Some(end) = ended(plan, &learner, &running, status, &mut lives)? {
+            return Ok(end);
+        }
+        running = learner.restart(&mut lives, pauses()).await?;
+    };
     let commander_url = format!("http://{}", first.address);
     tracing::debug!(learner = url, commander = commander_url, "services");
 
@@ -117,7 +134,7 @@ pub(crate) async fn run(
 
     let (sender, mut events) = mpsc::channel(64);
     let watching = tokio::spawn(watch(url.clone(), sender));
-    let (mut lives, mut draining, mut shown) = (LIVES, false, (0, false));
+    let (mut draining, mut shown) = (false, (0, false));
     let mut quiet = tokio::time::interval(SILENCE);
     quiet.reset();
     let end = loop {
@@ -131,23 +148,11 @@ pub(crate) async fn run(
             }
             _ = quiet.tick() => tell_what_is_missing(&url, logs).await,
             status = running.wait() => {
-                let status = status?;
-                if !plan.folder.is_dir() {
-                    break Err(TrainError::Gone(plan.folder.to_owned()).into());
+                match ended(plan, &learner, &running, status?, &mut lives) {
+                    Ok(None) => {}
+                    end => break end.map(|end| end.unwrap_or(TrainEnd::Stopped)),
                 }
-                let (code, reason) = (code_of(status), running.failure(status));
-                match code {
-                    Some(exit::OK) => break Ok(TrainEnd::Finished),
-                    Some(exit::TEMPORARY) => break Ok(TrainEnd::Stopped),
-                    _ => lives -= 1,
-                }
-                if lives == 0 || matches!(code, Some(exit::USAGE | exit::CANNOT_CREATE)) {
-                    break Err(learner.gave_up(code, &reason));
-                }
-                tracing::warn!(reason, "the learner died; restarting it from its checkpoint");
-                let mut millis = 200;
-                let wait = || Duration::from_millis(std::mem::replace(&mut millis, 1000));
-                running = learner.restart(&mut lives, wait).await?;
+                running = learner.restart(&mut lives, pauses()).await?;
             },
             Some(ended) = services.join_next() => {
                 if let Err(error) = ended.map_err(anyhow::Error::from).and_then(|result| result) {
@@ -180,6 +185,36 @@ pub(crate) async fn run(
     stop.cancel();
     while services.join_next().await.is_some() {}
     end
+}
+
+/// The time before each attempt at a restart.
+fn pauses() -> impl FnMut() -> Duration {
+    let mut millis = 200;
+    move || Duration::from_millis(std::mem::replace(&mut millis, 1000))
+}
+
+/// How the training ended with its learner; `None` if the learner is to continue from its checkpoint.
+fn ended(
+    plan: &ServicesPlan<'_>,
+    learner: &Service<'_>,
+    running: &Running,
+    status: ExitStatus,
+    lives: &mut u32,
+) -> anyhow::Result<Option<TrainEnd>> {
+    if !plan.folder.is_dir() {
+        return Err(TrainError::Gone(plan.folder.to_owned()).into());
+    }
+    let (code, reason) = (code_of(status), running.failure(status));
+    match code {
+        Some(exit::OK) => return Ok(Some(TrainEnd::Finished)),
+        Some(exit::TEMPORARY) => return Ok(Some(TrainEnd::Stopped)),
+        _ => *lives -= 1,
+    }
+    if *lives == 0 || matches!(code, Some(exit::USAGE | exit::CANNOT_CREATE)) {
+        return Err(learner.gave_up(code, &reason));
+    }
+    tracing::warn!(reason, "the learner died; restarting it from its checkpoint");
+    Ok(None)
 }
 
 /// A restarted learner and a reconnected stream repeat iterations that were shown before.

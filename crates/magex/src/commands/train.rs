@@ -21,7 +21,7 @@ use magex_runtime::process::processors;
 use magex_runtime::{backoff, exit, http, limits, server, shutdown};
 use magex_viewer::page::{LivePage, RunInfo};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
