@@ -173,6 +173,7 @@ pub const METRICS: &[Metric] = &[
         sampled: Some("reward"),
         label: "reward",
         format: Format::Decimals(3),
+        progress: true,
         plot: Some(Scale::Free),
         replay: true,
         ..SHARE
@@ -189,6 +190,9 @@ const COST: Metric = Metric {
     replay: true,
     ..SHARE
 };
+
+/// How tables write an arrival after the horizon.
+pub const NEVER: &str = "never";
 
 /// Row of the metric that decides when a run stops.
 pub const SUCCESS_RATE: usize = row("success_rate");
@@ -233,6 +237,12 @@ impl Metric {
     /// Whether metrics.jsonl and summary.json have it of the greedy evaluation.
     pub fn greedy(&self) -> bool {
         self.sampled != Some(self.name)
+    }
+
+    /// A value as tables show it, in a task with this horizon: an arrival after it never happened.
+    pub fn write_within(&self, value: f64, horizon: u32) -> String {
+        let never = self.name == METRICS[ARRIVAL_STEP].name && value > f64::from(horizon);
+        if never { NEVER.to_owned() } else { self.write(value) }
     }
 
     /// A value as tables show it.
