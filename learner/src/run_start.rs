@@ -246,7 +246,7 @@ mod tests {
         assert!(changes.has("run.max_steps") && changes.target(), "{changes}");
         (other.run.seed, other.mappo.gamma) = (2, 0.5);
         let forbidden = between(&own, &other).forbidden().unwrap();
-        assert_eq!(forbidden, "mappo.gamma was 0.99 and is 0.5, run.seed was 1 and is 2");
+        assert_eq!(forbidden, "mappo.gamma was 0.9 and is 0.5, run.seed was 1 and is 2");
         other = own.clone();
         other.run.keep_checkpoints = 9;
         assert!(!between(&own, &other).target());

@@ -92,7 +92,7 @@ fn numbers_in_variables_are_written_as_in_options() {
     // Single precision prints as it is written.
     assert_eq!(
         (run["target_success"].to_string(), config["mappo"]["gae_lambda"].to_string()),
-        ("0.995".into(), "0.95".into())
+        ("0.999".into(), "0.9".into())
     );
     let seed = "9223372036854775807";
     assert!(stdout(&format!("train --seed {seed} --print-config"), &[]).contains(&format!("seed = {seed}\n")));

@@ -129,7 +129,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         let half = line(3)[..9].to_owned();
-        std::fs::write(&path, line(0) + &line(0) + &line(1) + &half).unwrap();
+        std::fs::write(&path, line(0) + &line(1) + &line(2) + &half).unwrap();
         let file = std::fs::metadata(&path).unwrap().ino();
         MetricsFile::reopen(folder.path(), 2).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), line(0) + &line(1));

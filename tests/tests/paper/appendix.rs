@@ -2,7 +2,7 @@
 
 use crate::support::{actor, actor_shapes, stream};
 use magex_assign::exact_points;
-use magex_core::config::{CommanderConfig, CommanderPolicy, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderConfig, CommanderPolicy, ExecutorKind, MappoConfig, RunConfig};
 use magex_core::joint_state::JointState;
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
@@ -73,7 +73,8 @@ fn appendix_a_2_the_literal_executor_sees_absolute_positions_and_ours_relative_o
 
 #[test]
 fn appendix_table_mappo_hyperparameters() {
-    let RunConfig { mappo, executor, collect, run, .. } = RunConfig::default();
+    let RunConfig { executor, collect, run, .. } = RunConfig::default();
+    let mappo = MappoConfig::default();
     assert_eq!((mappo.max_grad_norm, mappo.gae_lambda, mappo.gamma, mappo.huber_delta), (10.0, 0.95, 0.99, 10.0));
     assert_eq!(mappo.adam_epsilon, 1e-5);
     assert!(executor.feature_norm, "feature normalisation");

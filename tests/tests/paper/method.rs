@@ -3,7 +3,7 @@
 use crate::support::{act, network, run, scheduler, scores, stream};
 use candle_core::{Device, Tensor};
 use magex_assign::exact_points;
-use magex_core::config::{CommanderPolicy, ExecutorKind, RunConfig};
+use magex_core::config::{CommanderPolicy, ExecutorKind, MappoConfig, RunConfig};
 use magex_core::ids::Mode;
 use magex_core::task::{RewardConfig, Spawn, TaskConfig, TaskSettings};
 use magex_core::trajectory::Trajectory;
@@ -17,7 +17,7 @@ use magex_tests::{small, train, updates};
 
 #[test]
 fn section_3_1_rewards_are_discounted_and_advantages_are_generalised() {
-    let RunConfig { mappo, .. } = RunConfig::default();
+    let mappo = MappoConfig::default();
     assert!((0.0..1.0).contains(&mappo.gamma));
     // Σ_l γ^l r_{t+l}: with λ = 1 and values of zero the return is that sum.
     let gae = Gae { gamma: mappo.gamma, lambda: 1.0, bootstrap: false };

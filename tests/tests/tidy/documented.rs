@@ -1,12 +1,14 @@
 //! Keys and dependencies are documented, with the defaults that the code has.
 
 use crate::workspace::{files, read};
-use magex_core::config::RunConfig;
+use magex_core::config::{MappoConfig, RunConfig, RunSection};
 use magex_core::task::{Spawn, TaskConfig, TaskName};
 
 /// Every configuration key with its default, as TOML: the default run, and the sections of the other tasks.
 pub(crate) fn configuration() -> String {
-    let mut config = RunConfig::default().to_toml().unwrap();
+    // The tables tell the defaults of a file with a task, not those of the first run.
+    let plain = RunConfig { run: RunSection::default(), mappo: MappoConfig::default(), ..RunConfig::default() };
+    let mut config = plain.to_toml().unwrap();
     for name in TaskName::ALL.into_iter().filter(|&name| name != RunConfig::default().task.name) {
         let task = TaskConfig::of(name, 4, Spawn::Uniform);
         let other = RunConfig { task, ..RunConfig::default() }.to_toml().unwrap();

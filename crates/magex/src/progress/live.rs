@@ -53,7 +53,7 @@ impl LiveLine {
         size.ok().map(|size| usize::from(size.ws_col)).filter(|&width| width > 0).unwrap_or(USUAL_WIDTH)
     }
 
-    /// An iteration was reported: so many iterations and joint steps are complete. `over` if it was the last.
+    /// An iteration was reported, after which these iterations and joint steps are complete. `over` if it was the last.
     pub(super) fn iteration(&self, iterations: u32, steps: u64, over: bool) {
         let mut place = lock(&self.place);
         (place.completed, place.over) = ((iterations, steps), over);
@@ -73,7 +73,7 @@ impl LiveLine {
         self.shards(0, 0);
     }
 
-    /// So many of the iteration's shards have arrived; 0 of 0 while it is unknown.
+    /// The iteration's shards that have arrived; 0 of 0 while that is unknown.
     pub(crate) fn shards(&self, done: u64, total: u64) {
         let place = lock(&self.place);
         let (iteration, steps) = place.completed;
