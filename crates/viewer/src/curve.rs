@@ -102,7 +102,7 @@ const GUTTER: f64 = 36.0;
 /// Height of the picture's title.
 const HEADER: f64 = 72.0;
 /// Height of a panel's title and legend, of its horizontal axis with the gap below, and of the plots.
-const TITLE: f64 = 42.0;
+const TITLE: f64 = 48.0;
 const AXIS: f64 = 40.0;
 const LARGE: f64 = 210.0;
 const SMALL: f64 = 120.0;
@@ -202,7 +202,7 @@ impl Svg {
         let (top, bottom) = (head + TITLE, head + TITLE + height);
         let (low, high) = limits(panel.plot.scale, panel.log, &panel.values());
         let y = Axis { from: low, to: high, start: bottom, end: top, log: panel.log };
-        let rows = y.ticks(if height > SMALL { 6 } else { 4 });
+        let rows = y.ticks(6);
         let names = match panel.plot.scale {
             Scale::Share => rows.iter().map(|tick| format!("{:.0} %", 100.0 * tick)).collect(),
             _ => labels(&rows, panel.log),
@@ -215,7 +215,7 @@ impl Svg {
             self.text([start - 8.0, y.at(tick) + 4.0], "end", "soft label", name);
         }
         let x = Axis { from: 0.0, to: self.last, start, end: right, log: false };
-        for tick in ticks(0.0, self.last, if height > SMALL { 8 } else { 4 }) {
+        for tick in ticks(0.0, self.last, if height > SMALL { 10 } else { 6 }) {
             self.line([x.at(tick), top], [x.at(tick), bottom]);
             self.text([x.at(tick), bottom + 17.0], "middle", "soft label", &short_count(tick));
         }

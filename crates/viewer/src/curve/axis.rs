@@ -20,13 +20,13 @@ impl Axis {
         self.start + (place(value) - from) / (to - from) * (self.end - self.start)
     }
 
-    /// About `count` values to label.
+    /// Up to `count` values to label.
     pub(super) fn ticks(&self, count: u32) -> Vec<f64> {
         if !self.log {
             return ticks(self.from, self.to, count);
         }
         let (first, last) = (self.from.log10().ceil() as i32, self.to.log10().floor() as i32);
-        let every = (1 + last - first).div_euclid(count as i32).max(1) as usize;
+        let every = (1 + last - first).max(0).unsigned_abs().div_ceil(count).max(1) as usize;
         (first..=last).step_by(every).map(|power| 10f64.powi(power)).collect()
     }
 }
@@ -60,14 +60,13 @@ pub(super) fn limits(scale: Scale, log: bool, values: &[f64]) -> (f64, f64) {
     }
 }
 
-/// About `count` round values (1, 2 or 5 times a power of ten apart) in low..=high.
+/// Round values (1, 2 or 5 times a power of ten apart) in low..=high: as many as possible up to `count`, at least two.
 pub(super) fn ticks(low: f64, high: f64, count: u32) -> Vec<f64> {
-    let rough = (high - low) / f64::from(count);
-    let power = 10f64.powf(rough.log10().floor());
-    let step =
-        [1.0, 2.0, 5.0].into_iter().map(|k| k * power).find(|&step| step >= rough * 0.999).unwrap_or(10.0 * power);
-    let (first, last) = ((low / step - 1e-9).ceil() as i64, (high / step + 1e-9).floor() as i64);
-    (first..=last).map(|k| k as f64 * step).collect()
+    let power = 10f64.powf(((high - low) / f64::from(count)).log10().floor());
+    let ends = |step: f64| ((low / step - 1e-9).ceil() as i64, (high / step + 1e-9).floor() as i64);
+    let few = |step: &f64| ends(*step).1 - ends(*step).0 < i64::from(count);
+    let step = [1.0, 2.0, 5.0].into_iter().map(|k| k * power).find(few).unwrap_or(10.0 * power);
+    (ends(step).0..=ends(step).1).map(|k| k as f64 * step).collect()
 }
 
 /// Labels that tell the ticks apart.
@@ -111,9 +110,15 @@ mod tests {
     fn ticks_are_round_and_inside_the_axis() {
         assert_eq!(ticks(0.0, 1.0, 6), [0.0, 0.2, 0.4, 0.6000000000000001, 0.8, 1.0]);
         assert_eq!(ticks(0.0, 96_000.0, 8), [0.0, 20_000.0, 40_000.0, 60_000.0, 80_000.0]);
+        for k in 1..500 {
+            for (low, count) in [(0.0, 6), (0.0, 10), (-0.013 * f64::from(k), 6), (0.98, 5)] {
+                let ticks = ticks(low, low + 0.037 * f64::from(k), count);
+                assert!((2..=count as usize).contains(&ticks.len()), "{low}, {k}: {ticks:?}");
+            }
+        }
         let axis = Axis { from: 0.0004, to: 30.0, start: 100.0, end: 0.0, log: true };
         assert_eq!(axis.ticks(9), [0.001, 0.01, 0.1, 1.0, 10.0]);
-        assert!(axis.ticks(3).len() <= 5);
+        assert_eq!(axis.ticks(3), [0.001, 0.1, 10.0]);
         assert!((axis.at(0.0004) - 100.0).abs() < 1e-9 && axis.at(30.0).abs() < 1e-9);
     }
 

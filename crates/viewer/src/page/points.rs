@@ -34,7 +34,8 @@ pub(super) fn plots() -> String {
         let scale = match plot.scale {
             Scale::Share => json!({ "low": 0, "high": 1, "share": true }),
             Scale::FromOne => json!({ "line": 1 }),
-            Scale::FromZero | Scale::Free => json!({}),
+            Scale::FromZero => json!({ "zero": true }),
+            Scale::Free => json!({}),
         };
         let series = plot.series.iter().map(|one| (one.column, one.kind.look()));
         let series: Vec<_> = series.map(|(column, Look { class, label, .. })| [column, label, class]).collect();
