@@ -18,7 +18,7 @@ use magex_runtime::http;
 use magex_tests::sandbox::{binary, wait_until};
 use magex_tests::{drive, small, small_task, train};
 use magex_viewer::page::{LivePage, RunInfo};
-use serde_json::{Value, json};
+use serde_json::Value;
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::Path;
