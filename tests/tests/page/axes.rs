@@ -106,6 +106,7 @@ async fn axes_and_legends_can_be_read_on_a_screen_and_on_a_phone() {
     let (steps, iterations) = (browser.text("steps").await, browser.text("iteration").await);
     let per = browser.value("run.task.steps_per_iteration").await.as_u64().unwrap();
     assert_eq!((steps.replace(',', ""), iterations), ((2400 + per).to_string(), "16".to_owned()));
+    assert_eq!(browser.text("success-more").await, "evaluation at 2.4 k steps");
     assert!(browser.text("steps-more").await.contains("to the budget"), "{}", browser.text("steps-more").await);
     assert_eq!(browser.value("document.querySelector('#actors tbody tr').className").await, "late");
 
