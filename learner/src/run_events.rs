@@ -74,8 +74,9 @@ pub(crate) fn describe(shard: &Shard) -> String {
 /// Something that happened in the run, as `WatchRun` sends it.
 pub type RunEvent = v1::watch_run_response::Event;
 
-/// Parses a line of metrics.jsonl; `None` if it is not one.
-pub(crate) fn parse_report(line: String) -> Option<v1::IterationEvent> {
+/// Parses a line of metrics.jsonl, the last one of a run that has done what `completed` counts (iterations, joint steps); `None`
+/// if it is not one.
+pub(crate) fn parse_report(line: String, completed: (u32, u64)) -> Option<v1::IterationEvent> {
     let metrics: serde_json::Value = serde_json::from_str(&line).ok()?;
     Some(v1::IterationEvent {
         iteration: u32::try_from(metrics["iteration"].as_u64()?).ok()?,
@@ -83,5 +84,7 @@ pub(crate) fn parse_report(line: String) -> Option<v1::IterationEvent> {
         success: metrics["success_rate"].as_f64().map(|x| x as f32),
         reward: metrics["reward"].as_f64().map(|x| x as f32),
         metrics_json: line,
+        iterations_completed: completed.0,
+        joint_env_steps_trained: completed.1,
     })
 }

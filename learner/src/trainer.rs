@@ -1,17 +1,19 @@
 //! The training loop: publish → plan → collect → evaluate → update → record → checkpoint. It runs on its own thread and blocks
 //! on its [`Collector`]; its [`RunObserver`]s follow it. It has no connections.
 
+mod finish;
 mod outcome;
 mod plan;
 mod saving;
 
+use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::checkpoint::{self, CheckpointError, Progress};
 use crate::collector::Collector;
-use crate::report::means::{ClosingMeans, EvalSummary, IterationMeans, summarise};
+use crate::report::means::{EvalSummary, IterationMeans, summarise};
 use crate::report::metrics_file::MetricsFile;
 use crate::report::observer::{FileError, RunObserver, RunStart};
 use crate::report::records::{IterationMetrics, Summary, Timing};
@@ -24,11 +26,11 @@ use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::mappo::Mappo;
 use crate::train::stats::UpdateStats;
-use magex_core::config::RunConfig;
+use magex_core::config::{RunConfig, RunSection};
 use magex_core::ids::{Mode, RunId, Shard, WeightsVersion};
-use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
+use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, REWARD, SUCCESS_RATE};
 use magex_core::sha256;
-use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult, Trajectory};
+use magex_core::trajectory::{EvalOutcome, ShardResult, Trajectory};
 use magex_proto::v1::{FinishedEvent, IterationEvent};
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
@@ -122,7 +124,8 @@ impl Trainer {
             trainer.observe(MetricsFile::reopen(folder, progress.iteration)?);
             trainer.observe(EventFile::new(folder, Some(progress.joint_env_steps)));
         }
-        trainer.before = MetricsFile::last_line(folder).and_then(parse_report);
+        let completed = (progress.iteration, progress.joint_env_steps);
+        trainer.before = MetricsFile::last_line(folder).and_then(|line| parse_report(line, completed));
         trainer.progress = progress;
         trainer.learned = learned;
         Ok((trainer, skipped))
@@ -267,23 +270,24 @@ impl Trainer {
             timing.collect_s = clock.elapsed().as_secs_f64();
             let (trajectories, outcomes) = split(results);
 
-            let evaluation = self.evaluated(&outcomes);
-            let on_target = self.on_target(evaluation.as_ref());
+            let sampled = summarise(trajectories.iter().flat_map(|trajectory| &trajectory.metrics));
+            let episodes = IterationMeans { greedy: self.evaluated(&outcomes), sampled };
+            let on_target = self.on_target(&episodes);
             let target_reached = on_target >= EVALUATIONS_ON_TARGET;
             if target_reached || !train {
-                self.record(collector, &[], evaluation, timing, None)?;
+                self.record(collector, episodes, timing, None)?;
                 return self.finish(collector, target_reached);
             }
 
             let updates = self.update(&trajectories, &mut timing)?;
+            // The line stands at the version that was evaluated and rolled out, and at the steps that it had seen: the update
+            // leads to the next one. It precedes the checkpoint: after a kill in between, a resume truncates it and repeats the
+            // iteration.
+            self.record(collector, episodes, timing, Some(updates))?;
             // Counted when the iteration is complete: a resume from before that point evaluates again.
             self.progress.on_target = on_target;
             self.progress.iteration += 1;
             self.progress.joint_env_steps += self.config.steps_per_iteration();
-
-            // The line precedes the checkpoint: after a kill in between, a resume truncates it and repeats the iteration.
-            let episodes: Vec<EpisodeMetrics> = trajectories.iter().flat_map(|t| t.metrics.clone()).collect();
-            self.record(collector, &episodes, evaluation, timing, Some(updates))?;
 
             self.is_there()?;
             let clock = Instant::now();
@@ -314,7 +318,8 @@ impl Trainer {
             let record = self.observers.iter().any(|observer| observer.wants_recording());
             shards.extend(plan::evaluation(iteration, EVAL_SET_TRAINING, run.eval_episodes, Mode::Greedy, record));
         }
-        if train {
+        // The target may ask for the success of sampled actions, of the last version, too.
+        if train || run.target_sampled_success > 0.0 {
             shards.extend(plan::training(&self.config, iteration));
         }
         shards
@@ -326,14 +331,11 @@ impl Trainer {
     }
 
     /// Evaluations in a row that reached the target, with this one.
-    fn on_target(&self, evaluation: Option<&EvalSummary>) -> u32 {
-        match evaluation {
-            Some(evaluation) if evaluation.means[SUCCESS_RATE] >= Some(self.config.run.target_success.into()) => {
-                self.progress.on_target.saturating_add(1)
-            }
-            Some(_) => 0,
-            None => self.progress.on_target,
+    fn on_target(&self, episodes: &IterationMeans) -> u32 {
+        if episodes.greedy.is_none() {
+            return self.progress.on_target;
         }
+        if reached(&self.config.run, episodes) { self.progress.on_target.saturating_add(1) } else { 0 }
     }
 
     fn update(
@@ -362,22 +364,21 @@ impl Trainer {
     fn record(
         &mut self,
         collector: &dyn Collector,
-        episodes: &[EpisodeMetrics],
-        evaluation: Option<EvalSummary>,
+        episodes: IterationMeans,
         timing: Timing,
         updates: Option<(UpdateStats, CommanderStats)>,
     ) -> Result<(), TrainError> {
         let (executor, commander) = updates.unzip();
-        let steps = if episodes.is_empty() { 0.0 } else { self.config.steps_per_iteration() as f64 };
+        let trained = if executor.is_some() { self.config.steps_per_iteration() } else { 0 };
         let metrics = IterationMetrics {
             iteration: self.progress.iteration,
             joint_env_steps: self.progress.joint_env_steps,
             agent_steps: self.progress.joint_env_steps * self.config.task.agents as u64,
-            episodes: IterationMeans { greedy: evaluation, sampled: summarise(episodes) },
+            episodes,
             executor,
             commander,
             timing: timing.attributed(collector.collected().as_ref()),
-            joint_steps_per_s: steps / timing.seconds().max(1e-9),
+            joint_steps_per_s: trained as f64 / timing.seconds().max(1e-9),
             wall_s: self.wall_s(),
         };
         let report = IterationEvent {
@@ -386,6 +387,8 @@ impl Trainer {
             success: metrics.episodes.get(SUCCESS_RATE).map(|x| x as f32),
             reward: metrics.episodes.get(REWARD).map(|x| x as f32),
             metrics_json: serde_json::to_string(&metrics)?,
+            iterations_completed: metrics.iteration + u32::from(metrics.executor.is_some()),
+            joint_env_steps_trained: metrics.joint_env_steps + trained,
         };
         self.notify(|observer| observer.iteration(&metrics, &report));
         self.event(&RunEvent::Iteration(report));
@@ -400,61 +403,6 @@ impl Trainer {
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }
-
-    /// The last checkpoint, the evaluation that closes the run, and the files that the run leaves.
-    fn finish(&mut self, collector: &mut dyn Collector, target_reached: bool) -> Result<TrainOutcome, TrainError> {
-        let wall_s = self.wall_s();
-        self.save();
-        let (iteration, episodes) = (self.progress.iteration, self.config.run.final_episodes);
-        let mut plan: Vec<Shard> = plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Greedy, true).collect();
-        plan.extend(plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Sampled, false));
-        self.notify(|observer| observer.phase(Phase::Evaluating));
-        let results = match collector.collect(plan) {
-            Err(CollectError::Stopped(reason)) => return Ok(TrainOutcome::Stopped(reason)),
-            other => other?,
-        };
-        let (_, outcomes) = split(results);
-        self.notify(|observer| observer.evaluated(&outcomes));
-        let means_of = |mode: Mode| {
-            let evaluation = summarise(outcomes.iter().filter(|o| o.shard.mode == mode).flat_map(|o| &o.metrics));
-            evaluation.map(|evaluation| evaluation.means).ok_or(TrainError::EmptyEvaluation)
-        };
-        let (greedy, sampled_success_rate) = (means_of(Mode::Greedy)?, means_of(Mode::Sampled)?[SUCCESS_RATE]);
-        let (config, joint_env_steps, weights) = (&self.config, self.progress.joint_env_steps, self.learned.weights()?);
-        let summary = Summary {
-            episodes: ClosingMeans { greedy, sampled_success_rate },
-            joint_env_steps,
-            agent_steps: joint_env_steps * config.task.agents as u64,
-            wall_s,
-            iterations: iteration,
-            final_episodes: episodes,
-            target_reached,
-            weights_sha256: sha256::hex(&weights),
-            task: config.task.name.to_string(),
-            executor: config.executor.kind.to_string(),
-            scheduler: config.commander.kind.to_string(),
-            agents: config.task.agents,
-            seed: config.run.seed,
-        };
-        let recordings: Vec<&Recording> = outcomes.iter().filter_map(|o| o.recording.as_ref()).collect();
-        let (line, recordings) = (serde_json::to_string(&summary)?, serde_json::to_vec(&recordings)?);
-        // The summary is written last: a reader that finds it finds the other files too.
-        let files: [(&str, &[u8]); 3] =
-            [("weights.safetensors", &weights), ("recordings.json", &recordings), (SUMMARY_FILE, line.as_bytes())];
-        if let Some(reason) = self.write_last_files(collector, &files)? {
-            return Ok(TrainOutcome::Stopped(reason));
-        }
-        self.event(&RunEvent::Finished(FinishedEvent { summary_json: line }));
-        Ok(TrainOutcome::Finished(Box::new(summary)))
-    }
-}
-
-/// The summary of a complete run: summary.json exists and describes the weights of the checkpoint.
-fn summary_of(folder: &Path, iteration: u32, learned: &Learned) -> Result<Option<(Summary, String)>, TrainError> {
-    let Ok(line) = std::fs::read_to_string(folder.join(SUMMARY_FILE)) else { return Ok(None) };
-    let Ok(summary) = serde_json::from_str::<Summary>(&line) else { return Ok(None) };
-    let same = summary.iterations == iteration && summary.weights_sha256 == sha256::hex(&learned.weights()?);
-    Ok(same.then_some((summary, line)))
 }
 
 /// Training threads: as many as can be started, up to `most`. Their number changes no number of the run.
@@ -473,6 +421,16 @@ fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
             built => return built.map_err(|error| TrainError::Threads(error.to_string())),
         }
     }
+}
+
+/// Whether the weights are what the run trains for.
+fn reached(run: &RunSection, episodes: &IterationMeans) -> bool {
+    let mean = |summary: Option<EvalSummary>, metric: usize| summary.and_then(|summary| summary.means[metric]);
+    let (success, sampled) = (mean(episodes.greedy, SUCCESS_RATE), mean(episodes.sampled, SUCCESS_RATE));
+    let collisions = mean(episodes.greedy, COLLISIONS_PER_AGENT_STEP).unwrap_or_default();
+    success >= Some(run.target_success.into())
+        && sampled.unwrap_or_default() >= run.target_sampled_success.into()
+        && collisions <= run.target_collisions.into()
 }
 
 /// Which folder this is, whatever its name.

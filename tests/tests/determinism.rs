@@ -102,7 +102,7 @@ fn a_stopped_and_resumed_run_ends_with_the_same_bits() {
             .lines()
             .map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["iteration"].as_u64().unwrap())
             .collect();
-        assert_eq!(iterations, [1, 2, 3, 4, 5, 5], "one line per iteration and the closing evaluation");
+        assert_eq!(iterations, [0, 1, 2, 3, 4, 5], "one line per version of the weights");
     }
 }
 
@@ -330,10 +330,10 @@ fn observers_follow_a_run_in_order_and_change_no_number() {
         "begin",
         "Collecting",
         "Training",
-        "iteration 1 on disk",
+        "iteration 0 on disk",
         "Collecting",
         "Training",
-        "iteration 2 on disk",
+        "iteration 1 on disk",
         "checkpoint 2",
         "Evaluating",
         "iteration 2 on disk",

@@ -115,7 +115,7 @@ fn with_json_every_line_of_standard_error_is_an_object_and_the_fatal_one_has_the
         ("train --frobnicate", 64),
         ("eval nowhere", 64),
         ("assign --random 2 --connect http://127.0.0.1:9", 69),
-        ("health http://127.0.0.1:9", 1),
+        ("health http://127.0.0.1:9", 69),
         ("bench env", 64),
     ] {
         let output = magex(line, &[JSON]).current_dir(folder.path()).output().unwrap();

@@ -71,7 +71,7 @@ fn what_cannot_be_used_is_named_before_anything_is_ready() {
         ("--data @file", 73, "file: a file; give a folder"),
         ("--data @taken", 73, "another commander uses it"),
         ("--weights @nowhere", 64, "no such file; give the folder of a finished run"),
-        ("--weights @file", 64, "file: no weights file; give the folder of a finished run"),
+        ("--weights @file", 64, "file: not a weights file (safetensors); give the folder of a finished run"),
         ("--identities @file", 64, "--identities"),
         ("--identities @nowhere", 64, "--identities"),
         ("--tls-cert @one.pem --tls-key @two.key", 64, "--tls-key"),
@@ -161,7 +161,8 @@ fn certificates_and_identities_are_read_again_and_bad_ones_change_nothing() {
     let hash = |token: &str| magex_proto::weights::sha256_hex(token.as_bytes());
     let identities =
         |token: &str| format!("[[identity]]\nname = 'a'\nrole = 'client'\ntoken_sha256 = '{}'\n", hash(token));
-    (copy("one.pem", "own.pem"), copy("one.key", "own.key"));
+    copy("one.pem", "own.pem");
+    copy("one.key", "own.key");
     replace(&place.path("identities"), &identities("first"));
     let tls = "--tls-cert @own.pem --tls-key @own.key --identities @identities";
     let mut commander = place.process("log", &format!("commander --listen 127.0.0.1:0 {tls}"));

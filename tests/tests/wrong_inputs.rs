@@ -314,7 +314,7 @@ fn by_hand() -> Vec<Row> {
         ("assign --random 2 --connect https://127.0.0.1:9", 64, &["--connect", "--tls-ca"]),
         ("health nowhere", 64, &["nowhere"]),
         ("health http://127.0.0.1:9 --timeout 5M", 64, &["--timeout", "1 to 3600"]),
-        ("health http://127.0.0.1:9", 1, &["127.0.0.1:9"]),
+        ("health http://127.0.0.1:9", 69, &["127.0.0.1:9"]),
         ("verify {f}/none", 64, &["{f}/none"]),
         ("verify {f}/folder", 1, &[]),
         ("bench env", 64, &["magex-bench -- env"]),

@@ -181,6 +181,7 @@ pub const METRICS: &[Metric] = &[
         sampled: Some("reward"),
         label: "reward",
         format: Format::Decimals(3),
+        progress: true,
         plot: Some(Scale::Free),
         replay: true,
         ..SHARE
@@ -197,6 +198,9 @@ const COST: Metric = Metric {
     replay: true,
     ..SHARE
 };
+
+/// How tables write an arrival after the horizon.
+pub const NEVER: &str = "never";
 
 /// Row of the metric that decides when a run stops.
 pub const SUCCESS_RATE: usize = row("success_rate");
@@ -247,6 +251,12 @@ impl Metric {
     pub fn series(&self) -> impl Iterator<Item = (&'static str, Kind)> {
         let greedy = self.greedy().then_some((self.name, Kind::Greedy));
         greedy.into_iter().chain(self.sampled.map(|column| (column, Kind::Sampled)))
+    }
+
+    /// A value as tables show it, in a task with this horizon: an arrival after it never happened.
+    pub fn write_within(&self, value: f64, horizon: u32) -> String {
+        let never = self.name == METRICS[ARRIVAL_STEP].name && value > f64::from(horizon);
+        if never { NEVER.to_owned() } else { self.write(value) }
     }
 
     /// A value as tables show it.

@@ -1,6 +1,7 @@
 //! Rollouts in this process: the same episodes, goals and bits as in the cluster, without a network.
 
 use crate::parallel;
+use crate::progress::LiveLine;
 use magex_actor::rollout::Roller;
 use magex_commander::shard_goals::answer;
 use magex_core::config::{CommanderPolicy, RunConfig};
@@ -12,7 +13,7 @@ use magex_nets::commander::Commander;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 /// One version of the weights, loaded for rollouts.
 #[derive(Debug)]
@@ -72,12 +73,18 @@ pub struct LocalCollector {
     threads: usize,
     policy: Option<LoadedPolicy>,
     stop: Arc<AtomicBool>,
+    live: Option<LiveLine>,
 }
 
 impl LocalCollector {
     /// Setting `stop` ends the run after the current iteration.
     pub fn new(config: &RunConfig, threads: usize, stop: Arc<AtomicBool>) -> Self {
-        Self { config: config.clone(), threads, policy: None, stop }
+        Self { config: config.clone(), threads, policy: None, stop, live: None }
+    }
+
+    /// Shows the shards that are done in a status line.
+    pub(crate) fn showing(self, live: Option<LiveLine>) -> Self {
+        Self { live, ..self }
     }
 }
 
@@ -88,10 +95,18 @@ impl Collector for LocalCollector {
     }
 
     fn collect(&mut self, plan: Vec<Shard>) -> Result<Vec<ShardResult>, CollectError> {
-        match &self.policy {
-            Some(policy) => policy.rollout_all(&plan, self.threads, |_| {}),
-            None => Err(CollectError::NoWeights),
+        let (total, done) = (plan.len() as u64, AtomicU64::new(0));
+        let show = |_: &Shard| {
+            if let Some(live) = &self.live {
+                live.shards(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+            }
+        };
+        let policy = self.policy.as_ref().ok_or(CollectError::NoWeights)?;
+        let results = policy.rollout_all(&plan, self.threads, show)?;
+        if let Some(live) = &self.live {
+            live.doing("updating");
         }
+        Ok(results)
     }
 
     fn stop_requested(&self) -> Option<StopReason> {

@@ -1,30 +1,36 @@
-//! Progress of a run: a table (80 columns for Simple Spread) with a live status line on a terminal, log lines elsewhere.
+//! Progress of a run: a table as wide as the terminal allows, with a live status line below it; log lines elsewhere.
 
-use crate::logging::set_live_line;
-use crate::output::{colours, note, thousands};
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use magex_core::config::RunConfig;
+mod columns;
+mod live;
+
+use crate::output::{colours, note};
+use columns::{Column, heading, line};
+pub(crate) use live::LiveLine;
+use magex_core::config::{COLLISIONS_ANY, RunConfig, RunSection};
 use magex_core::metrics_table::{
-    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, SECOND_COST_RATIO, SUCCESS_RATE,
-    as_written,
+    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, REWARD, SECOND_COST_RATIO,
+    SUCCESS_RATE, as_written,
 };
 use magex_learner::run_events::RunEvent;
 use magex_runtime::telemetry;
 use serde::Deserialize;
 use serde_json::Value;
 use std::io::IsTerminal as _;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
+/// Rows below a heading.
 const PAGE: u32 = 40;
 
 /// The part of a line of metrics.jsonl that is shown.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, Deserialize)]
 struct Row {
     iteration: u32,
     joint_env_steps: u64,
     timing: Shares,
     joint_steps_per_s: f64,
     wall_s: f64,
+    /// What the update of the executor reports; null on a line that does not train.
+    executor: Option<serde::de::IgnoredAny>,
     /// The columns of the episodes' metrics, among others.
     #[serde(flatten)]
     columns: serde_json::Map<String, Value>,
@@ -59,10 +65,14 @@ impl Shares {
 }
 
 pub(crate) struct Progress {
-    bar: Option<ProgressBar>,
+    /// On a terminal.
+    live: Option<LiveLine>,
+    /// Rows since the last heading, and the columns that it has.
     rows: u32,
+    columns: Vec<Column>,
     target: f64,
     metrics: Vec<usize>,
+    horizon: u32,
     colours: bool,
     /// Time at which the last iteration was reported.
     pub(crate) last_iteration: Option<Instant>,
@@ -72,11 +82,20 @@ pub(crate) struct Progress {
 
 impl Progress {
     pub(crate) fn start(config: &RunConfig, title: &str, out: &str) -> Self {
-        let target = as_written(config.run.target_success.into());
+        let run = &config.run;
+        let target = as_written(run.target_success.into());
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
-        let metrics = (0..METRICS.len()).filter(shown).collect();
-        let mut progress =
-            Self { bar: None, rows: 0, target, metrics, colours: false, last_iteration: None, page: None };
+        let mut progress = Self {
+            live: None,
+            rows: 0,
+            columns: Vec::new(),
+            target,
+            metrics: (0..METRICS.len()).filter(shown).collect(),
+            horizon: config.task.horizon,
+            colours: false,
+            last_iteration: None,
+            page: None,
+        };
         if !std::io::stderr().is_terminal() || telemetry::is_json() {
             tracing::info!(
                 out,
@@ -85,9 +104,11 @@ impl Progress {
                 spawn = %config.task.spawn,
                 executor = %config.executor.kind,
                 scheduler = %config.commander.kind,
-                seed = config.run.seed,
-                max_steps = config.run.max_steps,
+                seed = run.seed,
+                max_steps = run.max_steps,
                 target_success = rounded(target),
+                target_sampled_success = rounded(run.target_sampled_success.into()),
+                target_collisions = rounded(run.target_collisions.into()),
                 "training"
             );
             return progress;
@@ -95,17 +116,15 @@ impl Progress {
         progress.colours = colours();
         let [bold, plain] = if progress.colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
         note(format!("{bold}{}{plain}", crate::artifacts::describe(config)));
-        note(format!("{title} · {out}\n"));
-        let bar = ProgressBar::with_draw_target(Some(config.run.max_steps), ProgressDrawTarget::stderr_with_hz(10));
-        let template = "{spinner:.cyan} {bar:12.cyan/dim} {human_pos}/{human_len} steps · {msg} · {elapsed}";
-        if let Ok(style) = ProgressStyle::with_template(template) {
-            bar.set_style(style.progress_chars("━━─"));
-        }
-        bar.set_message("waiting for the first iteration");
-        bar.enable_steady_tick(Duration::from_millis(100));
-        set_live_line(Some(bar.clone()));
-        progress.bar = Some(bar);
+        note(format!("{title} · {out}"));
+        note(format!("{}\n", until(run)));
+        progress.live = Some(LiveLine::start(run.max_steps, config.steps_per_iteration()));
         progress
+    }
+
+    /// The status line, if there is a terminal, for what reports shards within an iteration.
+    pub(crate) fn live(&self) -> Option<LiveLine> {
+        self.live.clone()
     }
 
     pub(crate) fn event(&mut self, event: &RunEvent) {
@@ -114,6 +133,10 @@ impl Progress {
                 Ok(row) => {
                     self.last_iteration = Some(Instant::now());
                     self.row(&row);
+                    if let Some(live) = &self.live {
+                        let over = row.executor.is_none();
+                        live.iteration(report.iterations_completed, report.joint_env_steps_trained, over);
+                    }
                 }
                 Err(error) => tracing::warn!(%error, "the metrics of an iteration are malformed"),
             },
@@ -125,64 +148,61 @@ impl Progress {
 
     pub(crate) fn page(&mut self, address: &str) {
         let url = format!("http://{address}/");
-        match &self.bar {
+        match &self.live {
             Some(_) => note(format!("live page: {url}\n")),
             None => tracing::info!(url, "live page"),
         }
         self.page = Some(url);
     }
 
+    /// Words that stay in the status line, whatever is reported later.
     pub(crate) fn status(&self, text: &str) {
-        if let Some(bar) = &self.bar {
-            bar.set_message(text.to_owned());
+        if let Some(live) = &self.live {
+            live.keep(text);
         }
     }
 
     pub(crate) fn end(&mut self) {
-        set_live_line(None);
-        if let Some(bar) = self.bar.take() {
-            bar.finish_and_clear();
+        if let Some(live) = self.live.take() {
+            live.end();
         }
     }
 
     fn row(&mut self, row: &Row) {
-        let [collect, update, commander, checkpoint] = row.timing.percent();
-        let Some(bar) = &self.bar else {
-            // A log line has fixed fields: those worth following without the file.
-            let crashed = row.metric(COLLISION_RATE).filter(|_| self.metrics.contains(&COLLISION_RATE));
-            tracing::info!(
-                iteration = row.iteration,
-                joint_env_steps = row.joint_env_steps,
-                success_rate = row.metric(SUCCESS_RATE).map(rounded),
-                sampled_success_rate = row.sampled(SUCCESS_RATE).map(rounded),
-                arrival_step = row.metric(ARRIVAL_STEP).map(rounded),
-                collisions_per_agent_step = row.metric(COLLISIONS_PER_AGENT_STEP).map(rounded),
-                collision_rate = crashed.map(rounded),
-                cost_ratio = row.metric(COST_RATIO).map(rounded),
-                second_cost_ratio = row.metric(SECOND_COST_RATIO).map(rounded),
-                steps_per_s = row.joint_steps_per_s.round(),
-                collect_percent = collect.round(),
-                update_percent = update.round(),
-                commander_percent = commander.round(),
-                wall_s = rounded(row.wall_s),
-                "iteration"
-            );
-            return;
-        };
-        if self.rows.is_multiple_of(PAGE) {
-            let heading = heading(&self.metrics);
+        let Some(live) = &self.live else { return self.log(row) };
+        let columns = Column::fitting(&self.metrics, live.width());
+        if self.rows.is_multiple_of(PAGE) || columns != self.columns {
+            let heading = heading(&columns);
             note(if self.colours { format!("\x1b[2m{heading}\x1b[0m") } else { heading });
+            (self.rows, self.columns) = (0, columns);
         }
         self.rows += 1;
         let reached = row.metric(SUCCESS_RATE).is_some_and(|success| success >= self.target);
-        note(line(row, [collect, update, commander, checkpoint], &self.metrics, reached && self.colours));
-        bar.set_position(row.joint_env_steps);
-        let next = if row.sampled(SUCCESS_RATE).is_none() {
-            "closing evaluation".into()
-        } else {
-            format!("iteration {}", row.iteration + 1)
-        };
-        bar.set_message(next);
+        note(line(row, &self.columns, self.horizon, reached && self.colours));
+    }
+
+    /// A log line has fixed fields: those worth following without the file.
+    fn log(&self, row: &Row) {
+        let [collect, update, commander, _] = row.timing.percent();
+        let crashed = row.metric(COLLISION_RATE).filter(|_| self.metrics.contains(&COLLISION_RATE));
+        tracing::info!(
+            iteration = row.iteration,
+            joint_env_steps = row.joint_env_steps,
+            success_rate = row.metric(SUCCESS_RATE).map(rounded),
+            sampled_success_rate = row.sampled(SUCCESS_RATE).map(rounded),
+            reward = row.metric(REWARD).map(rounded),
+            arrival_step = row.metric(ARRIVAL_STEP).map(rounded),
+            collisions_per_agent_step = row.metric(COLLISIONS_PER_AGENT_STEP).map(rounded),
+            collision_rate = crashed.map(rounded),
+            cost_ratio = row.metric(COST_RATIO).map(rounded),
+            second_cost_ratio = row.metric(SECOND_COST_RATIO).map(rounded),
+            steps_per_s = row.joint_steps_per_s.round(),
+            collect_percent = collect.round(),
+            update_percent = update.round(),
+            commander_percent = commander.round(),
+            wall_s = rounded(row.wall_s),
+            "iteration"
+        );
     }
 }
 
@@ -192,41 +212,20 @@ impl Drop for Progress {
     }
 }
 
-fn width(metric: usize) -> usize {
-    METRICS[metric].label.len().max(6)
-}
-
-/// The last column: percent of the time for rollouts, executor update and commander update.
-fn heading(metrics: &[usize]) -> String {
-    let mut text = format!("{:>4} {:>10}", "iter", "steps");
-    for &metric in metrics {
-        text += &format!(" {:>1$}", METRICS[metric].label, width(metric));
-        if metric == SUCCESS_RATE {
-            text += &format!(" {:>7}", "sampled");
-        }
+/// What ends the run, in one line.
+fn until(run: &RunSection) -> String {
+    let budget = format!("{} joint steps", crate::output::thousands(run.max_steps as f64));
+    if run.target_success > 1.0 {
+        return format!("ends after {budget}");
     }
-    text + &format!(" {:>7} roll/exe/com %", "steps/s")
-}
-
-fn line(row: &Row, percent: [f64; 4], metrics: &[usize], highlight: bool) -> String {
-    let cell = |metric: usize, value: Option<f64>| {
-        let text = value.map_or_else(|| "-".to_owned(), |value| METRICS[metric].write(value));
-        format!("{text:>0$}", width(metric))
-    };
-    let mut text = format!("{:>4} {:>10}", row.iteration, thousands(row.joint_env_steps as f64));
-    for &metric in metrics {
-        let value = cell(metric, row.metric(metric));
-        let highlight = highlight && metric == SUCCESS_RATE;
-        text += &if highlight { format!(" \x1b[32m{value}\x1b[0m") } else { format!(" {value}") };
-        if metric == SUCCESS_RATE {
-            text += &format!(" {}", cell(metric, row.sampled(metric)));
-        }
+    let mut goals = vec![format!("success {}", run.target_success)];
+    if run.target_sampled_success > 0.0 {
+        goals.push(format!("sampled {}", run.target_sampled_success));
     }
-    let (speed, times) = match row.sampled(SUCCESS_RATE) {
-        Some(_) => (thousands(row.joint_steps_per_s), format!("{:.0}/{:.0}/{:.0}", percent[0], percent[1], percent[2])),
-        None => ("-".to_owned(), "evaluation".to_owned()),
-    };
-    text + &format!(" {speed:>7} {times}")
+    if run.target_collisions < COLLISIONS_ANY {
+        goals.push(format!("collisions {}", run.target_collisions));
+    }
+    format!("ends with {} twice in a row, or after {budget}", goals.join(", "))
 }
 
 /// To four decimals, for log lines.
@@ -238,30 +237,14 @@ fn rounded(value: f64) -> f64 {
 mod tests {
     use super::*;
 
-    const SHOWN: [usize; 4] = [SUCCESS_RATE, ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, COST_RATIO];
-
     #[test]
-    fn a_line_of_the_metrics_file_becomes_a_row_below_its_heading() {
-        let json = r#"{"iteration":12,"joint_env_steps":11520,"agent_steps":1,"success_rate":0.99996,
-            "sampled_success_rate":0.97,"arrival_step":61.25,"collisions_per_agent_step":0.0123,"cost_ratio":1.0004,
-            "timing":{"collect_s":3.0,"executor_s":6.0,"commander_s":1.0,"checkpoint_s":0.0},
-            "joint_steps_per_s":1234.5,"wall_s":9.0}"#;
-        let row: Row = serde_json::from_str(json).unwrap();
-        let text = line(&row, row.timing.percent(), &SHOWN, false);
-        assert_eq!(text, "  12     11,520  0.9999  0.9700    61.2     0.0123 1.0004   1,234 30/60/10");
-        let heading = heading(&SHOWN);
-        for (word, value) in [("success", "0.9999"), ("cost", "1.0004"), ("steps/s", "1,234")] {
-            assert_eq!(heading.find(word).unwrap() + word.len(), text.find(value).unwrap() + value.len(), "{word}");
-        }
-        assert!(heading.len() <= 80 && text.len() <= 80);
-    }
-
-    #[test]
-    fn missing_values_are_shown_as_a_dash() {
-        let json = r#"{"iteration":3,"joint_env_steps":10,"success_rate":null,"sampled_success_rate":null,
-            "arrival_step":null,"collisions_per_agent_step":null,"cost_ratio":null,
-            "timing":{"collect_s":0,"executor_s":0,"commander_s":0,"checkpoint_s":0},"joint_steps_per_s":0,"wall_s":1}"#;
-        let row: Row = serde_json::from_str(json).unwrap();
-        assert!(line(&row, row.timing.percent(), &SHOWN, true).contains(" - "));
+    fn what_ends_a_run_is_said_in_a_line() {
+        let mut run = RunSection { max_steps: 1_000_000, ..RunSection::default() };
+        assert_eq!(until(&run), "ends with success 0.995 twice in a row, or after 1,000,000 joint steps");
+        (run.target_sampled_success, run.target_collisions) = (0.95, 0.05);
+        let text = until(&run);
+        assert!(text.starts_with("ends with success 0.995, sampled 0.95, collisions 0.05 twice in a row, or after "));
+        run.target_success = 2.0;
+        assert_eq!(until(&run), "ends after 1,000,000 joint steps");
     }
 }

@@ -1,7 +1,7 @@
 //! The effective configuration of a run: defaults, then the file, then the options of the command.
 
 use anyhow::Context as _;
-use magex_core::config::{ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX};
+use magex_core::config::{COLLISIONS_ANY, ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX};
 use magex_core::task::{AGENTS_MAX, Spawn};
 use magex_runtime::options;
 use serde::de::DeserializeOwned;
@@ -20,6 +20,12 @@ pub(crate) struct Overrides {
     /// Stop when two evaluations in a row reach this greedy success rate [run.target_success].
     #[arg(long, value_name = "X", value_parser = options::number::<f32>(0.0, 2.0))]
     pub(crate) target_success: Option<f32>,
+    /// Stop only if sampled actions reach this success rate, too; 0 asks for none [run.target_sampled_success].
+    #[arg(long, value_name = "X", value_parser = options::number::<f32>(0.0, 1.0))]
+    pub(crate) target_sampled_success: Option<f32>,
+    /// Stop only if there are at most this many collisions per agent and step, too; 1000 allows any [run.target_collisions].
+    #[arg(long, value_name = "X", value_parser = options::number::<f32>(0.0, COLLISIONS_ANY))]
+    pub(crate) target_collisions: Option<f32>,
     /// Spend the whole budget, whatever success the evaluations reach [run.target_success = 2].
     #[arg(long, conflicts_with = "target_success")]
     pub(crate) whole_budget: bool,
@@ -42,6 +48,8 @@ impl Overrides {
         run.max_steps = self.max_steps.unwrap_or(run.max_steps);
         let target = self.whole_budget.then_some(2.0).or(self.target_success);
         run.target_success = target.unwrap_or(run.target_success);
+        run.target_sampled_success = self.target_sampled_success.unwrap_or(run.target_sampled_success);
+        run.target_collisions = self.target_collisions.unwrap_or(run.target_collisions);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
             // Keys that were derived from the team size are derived again; keys that were set stay.

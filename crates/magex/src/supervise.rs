@@ -4,11 +4,11 @@
 //! and the result is the same. The services hold a pipe to this process and stop when it ends.
 
 pub mod service;
+mod watching;
 
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
-use magex_learner::run_events::RunEvent;
 use magex_learner::run_lock::RunLock;
 use magex_learner::trainer::TrainError;
 use magex_proto::v1;
@@ -20,8 +20,9 @@ use std::path::Path;
 use std::process::ExitStatus;
 use std::time::Duration;
 use tokio::sync::mpsc;
-use tokio::task::JoinSet;
+use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
+use watching::{is_new, show_shards, watch};
 
 /// The learner may die this often without completing an iteration in between.
 const LIVES: u32 = 4;
@@ -134,7 +135,8 @@ pub(crate) async fn run(
 
     let (sender, mut events) = mpsc::channel(64);
     let watching = tokio::spawn(watch(url.clone(), sender));
-    let (mut draining, mut shown) = (false, (0, false));
+    let showing = progress.live().map(|live| tokio::spawn(show_shards(url.clone(), live)));
+    let (mut draining, mut shown) = (false, None);
     let mut quiet = tokio::time::interval(SILENCE);
     quiet.reset();
     let end = loop {
@@ -182,6 +184,7 @@ pub(crate) async fn run(
     };
     let _ = tokio::time::timeout(Duration::from_millis(100), rest).await;
     watching.abort();
+    showing.inspect(JoinHandle::abort);
     stop.cancel();
     while services.join_next().await.is_some() {}
     end
@@ -217,18 +220,6 @@ fn ended(
     Ok(None)
 }
 
-/// A restarted learner and a reconnected stream repeat iterations that were shown before.
-fn is_new(event: &RunEvent, shown: &mut (u32, bool)) -> bool {
-    let RunEvent::Iteration(report) = event else { return true };
-    let trained =
-        serde_json::from_str::<serde_json::Value>(&report.metrics_json).is_ok_and(|v| !v["executor"].is_null());
-    // The last line only evaluates: it has the number of the line before it.
-    let place = (report.iteration, !trained);
-    let new = place > *shown;
-    *shown = place.max(*shown);
-    new
-}
-
 /// Why nothing has happened for [`SILENCE`], if the learner waits for actors: the last words of an actor.
 async fn tell_what_is_missing(url: &str, logs: &Path) {
     let status = async {
@@ -253,44 +244,4 @@ async fn drain(url: &str) -> anyhow::Result<()> {
         anyhow::Ok(())
     };
     tokio::time::timeout(Duration::from_secs(3), call).await?
-}
-
-/// Follows the events of the run, across restarts of the learner.
-async fn watch(url: String, events: mpsc::Sender<RunEvent>) {
-    while !events.is_closed() {
-        if let Err(error) = follow(&url, &events).await {
-            tracing::debug!("the learner's events: {error:#}");
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
-}
-
-async fn follow(url: &str, events: &mpsc::Sender<RunEvent>) -> anyhow::Result<()> {
-    let mut client = LearnerServiceClient::new(client::endpoint(url)?.connect().await?);
-    let opened = tokio::time::timeout(Duration::from_secs(10), client.watch_run(v1::WatchRunRequest {})).await;
-    let mut stream = opened??.into_inner();
-    while let Some(message) = stream.message().await? {
-        if let Some(event) = message.event {
-            events.send(event).await?;
-        }
-    }
-    Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn event(iteration: u32, executor: &str) -> RunEvent {
-        let metrics_json = format!("{{\"executor\":{executor}}}");
-        RunEvent::Iteration(v1::IterationEvent { iteration, metrics_json, ..Default::default() })
-    }
-
-    #[test]
-    fn iterations_that_are_done_again_are_shown_once() {
-        let mut shown = (0, false);
-        let told = [(1, "{}"), (2, "{}"), (1, "{}"), (2, "{}"), (3, "{}"), (3, "null"), (3, "null")];
-        let new: Vec<bool> = told.iter().map(|(i, e)| is_new(&event(*i, e), &mut shown)).collect();
-        assert_eq!(new, [true, true, false, false, true, true, false]);
-    }
 }

@@ -10,7 +10,7 @@ mod tests;
 
 use crate::scene::Scene;
 use axum::body::Bytes;
-use magex_core::config::RunConfig;
+use magex_core::config::{COLLISIONS_ANY, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1;
@@ -128,7 +128,8 @@ impl LivePage {
             "name": task.name.to_string(), "agents": task.agents, "spawn": task.spawn.to_string(),
             "horizon": task.horizon, "executor": config.executor.kind.to_string(),
             "scheduler": config.commander.kind.to_string(), "seed": run.seed, "max_steps": run.max_steps,
-            "target_success": run.target_success, "eval_every": run.eval_every,
+            "target_success": run.target_success, "target_sampled_success": run.target_sampled_success,
+            "target_collisions": (run.target_collisions < COLLISIONS_ANY).then_some(run.target_collisions), "eval_every": run.eval_every,
             "max_iterations": config.max_iterations(), "steps_per_iteration": config.steps_per_iteration(),
         });
         Self {

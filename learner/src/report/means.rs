@@ -46,7 +46,7 @@ pub fn summarise<'a>(episodes: impl IntoIterator<Item = &'a EpisodeMetrics>) -> 
 pub struct IterationMeans {
     /// Greedy evaluation of the weights that the iteration started with.
     pub greedy: Option<EvalSummary>,
-    /// Training episodes: sampled actions and goals.
+    /// Training episodes with the same weights: sampled actions and goals.
     pub sampled: Option<EvalSummary>,
 }
 

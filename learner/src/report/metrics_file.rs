@@ -1,4 +1,5 @@
-//! metrics.jsonl: one line per iteration. docs/metrics.md lists every field.
+//! metrics.jsonl: one line per iteration, from 0: the number is the version of the weights that it evaluates and rolls out.
+//! docs/metrics.md lists every field.
 
 use crate::checkpoint::disk::{FileSystem, replace_file};
 use crate::report::observer::{FileError, RunObserver};
@@ -31,8 +32,8 @@ impl MetricsFile {
         Self::open(path)
     }
 
-    /// The file of a resumed run, truncated to the iterations that the checkpoint contains: the others will be repeated, with
-    /// the same numbers.
+    /// The file of a resumed run, truncated to the `iteration` iterations that the checkpoint contains, 0 to `iteration` - 1:
+    /// the others will be repeated, with the same numbers.
     pub(crate) fn reopen(folder: &Path, iteration: u32) -> Result<Self, FileError> {
         let path = folder.join("metrics.jsonl");
         let io = |error| FileError { path: path.clone(), error };
@@ -42,7 +43,7 @@ impl MetricsFile {
         })?;
         let trained = |line: &str| {
             let value = serde_json::from_str::<serde_json::Value>(line).ok().filter(|v| !v["executor"].is_null())?;
-            value["iteration"].as_u64().filter(|&number| number <= iteration.into())
+            value["iteration"].as_u64().filter(|&number| number < iteration.into())
         };
         let text = String::from_utf8_lossy(&bytes);
         // By number: each iteration is there once and in order, whatever wrote to the file.
@@ -127,21 +128,21 @@ mod tests {
     fn iterations_that_a_resume_repeats_are_truncated_in_place() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
-        let half = line(4)[..9].to_owned();
-        std::fs::write(&path, line(1) + &line(2) + &line(3) + &half).unwrap();
+        let half = line(3)[..9].to_owned();
+        std::fs::write(&path, line(0) + &line(0) + &line(1) + &half).unwrap();
         let file = std::fs::metadata(&path).unwrap().ino();
         MetricsFile::reopen(folder.path(), 2).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(0) + &line(1));
         // The file was truncated, not replaced.
         assert_eq!(std::fs::metadata(&path).unwrap().ino(), file);
-        assert_eq!(MetricsFile::last_line(folder.path()).unwrap(), line(2).trim_end());
+        assert_eq!(MetricsFile::last_line(folder.path()).unwrap(), line(1).trim_end());
         // An invalid line in the middle is removed.
-        std::fs::write(&path, line(1) + "half\n" + &line(2)).unwrap();
+        std::fs::write(&path, line(0) + "half\n" + &line(1)).unwrap();
         MetricsFile::reopen(folder.path(), 2).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(1) + &line(2));
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), line(0) + &line(1));
         // Two processes wrote at once.
-        std::fs::write(&path, [3, 4, 1, 5, 2, 4, 3].map(line).concat()).unwrap();
+        std::fs::write(&path, [2, 3, 0, 4, 1, 3, 2].map(line).concat()).unwrap();
         MetricsFile::reopen(folder.path(), 4).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), [1, 2, 3, 4].map(line).concat());
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), [0, 1, 2, 3].map(line).concat());
     }
 }

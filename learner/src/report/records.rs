@@ -35,15 +35,16 @@ impl Timing {
     }
 }
 
-/// One line of metrics.jsonl. Fields of an evaluation are null on iterations without one; fields of training are null on
-/// the last line, which only evaluates.
+/// One line of metrics.jsonl: the version of the weights that iteration `iteration` begins with, evaluated, rolled out and
+/// updated. Fields of an evaluation are null on iterations without one; those of the updates are null on the last line of a run,
+/// which does not train.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct IterationMetrics {
-    /// Iterations completed; equals the version of the weights that the evaluation measured on the last line.
+    /// From 0. Equals the version of the weights that was evaluated and rolled out.
     pub iteration: u32,
-    /// Joint environment steps trained on.
+    /// Joint environment steps that this version has been trained on.
     pub joint_env_steps: u64,
-    /// Agent steps trained on.
+    /// Agent steps that this version has been trained on.
     pub agent_steps: u64,
     /// What its episodes scored.
     #[serde(flatten)]

@@ -120,7 +120,7 @@ fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
     };
     let mut head = record(0, Event { file_version: Some("brain.Event:2".to_owned()), ..Event::default() });
     if let Some(steps) = resumed {
-        head.extend(record(steps + 1, Event { session_log: Some(SessionLog { status: 1 }), ..Event::default() }));
+        head.extend(record(steps, Event { session_log: Some(SessionLog { status: 1 }), ..Event::default() }));
     }
     file.write_all(&head)?;
     Ok((file, path))

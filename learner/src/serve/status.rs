@@ -19,8 +19,8 @@ impl RunStatusCache {
 
     pub(crate) fn iteration(&self, report: &v1::IterationEvent) {
         let mut reported = self.reported.lock();
-        reported.iteration = report.iteration;
-        reported.joint_env_steps = report.joint_env_steps;
+        reported.iteration = report.iterations_completed;
+        reported.joint_env_steps = report.joint_env_steps_trained;
         reported.success = report.success.or(reported.success);
         reported.reward = report.reward.or(reported.reward);
         reported.metrics_json.clone_from(&report.metrics_json);

@@ -1,5 +1,6 @@
 //! What an update reports: named numbers, in the order in which they are shown.
 
+use magex_core::metrics_table::as_written;
 use serde::ser::{Serialize, Serializer};
 
 /// An ordered list of named numbers, an object in JSON. Metrics, event files and pages show what is in it: they know no
@@ -26,7 +27,7 @@ impl UpdateStats {
 
 impl Serialize for UpdateStats {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(self.iter())
+        serializer.collect_map(self.iter().map(|(name, value)| (name, as_written(value))))
     }
 }
 
@@ -37,9 +38,9 @@ mod tests {
     #[test]
     fn the_order_of_names_is_kept() {
         let mut stats = UpdateStats::default();
-        stats.push("value_loss", 0.5);
+        stats.push("value_loss", f64::from(0.1_f32));
         stats.push("entropy", f64::NAN);
-        assert_eq!(serde_json::to_string(&stats).unwrap(), r#"{"value_loss":0.5,"entropy":null}"#);
-        assert_eq!((stats.get("value_loss"), stats.get("other")), (Some(0.5), None));
+        assert_eq!(serde_json::to_string(&stats).unwrap(), r#"{"value_loss":0.1,"entropy":null}"#);
+        assert_eq!((stats.get("value_loss"), stats.get("other")), (Some(f64::from(0.1_f32)), None));
     }
 }

@@ -40,11 +40,13 @@ async fn actors_leave_when_the_run_is_complete_and_watchers_see_it_all() {
     let actor = Actor::start(&learner.url, "a", FakeWorker::default());
     learner.iterate(0, 2).await.unwrap();
     let report = v1::IterationEvent {
-        iteration: 1,
-        joint_env_steps: 12,
+        iteration: 0,
+        joint_env_steps: 0,
         success: Some(0.5),
         reward: None,
         metrics_json: "{\"x\":1}".into(),
+        iterations_completed: 1,
+        joint_env_steps_trained: 12,
     };
     learner.handle.observer().event(&RunEvent::Iteration(report));
     let status = learner.handle.status();
@@ -113,11 +115,13 @@ async fn a_drain_without_actors_ends_the_iteration() {
 async fn a_resumed_run_reports_its_last_iteration_at_once() {
     let learner = Learner::start().await;
     let before = v1::IterationEvent {
-        iteration: 7,
-        joint_env_steps: 70,
+        iteration: 6,
+        joint_env_steps: 60,
         success: Some(0.5),
         reward: Some(-1.0),
         metrics_json: "{}".into(),
+        iterations_completed: 7,
+        joint_env_steps_trained: 70,
     };
     let (run_id, folder) = (RunId("run".into()), Path::new("nowhere"));
     learner.handle.observer().begin(RunStart { run_id: &run_id, folder, before: Some(&before) });

@@ -7,7 +7,7 @@ use crate::error::FieldError;
 use crate::task::{self, NOT_ZERO};
 use crate::toml_table;
 use serde::Deserialize;
-use toml::Table;
+use toml::{Table, Value};
 
 /// Keys that had another name: the old one and the present one. The old one is refused, naming the present one.
 pub(super) const RENAMED: &[(&str, &str)] = &[
@@ -58,6 +58,7 @@ fn collect_bounds(_key: &str) -> Option<String> {
 pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
     let file: Table = toml::from_str(text).map_err(|error| not_toml(text, &error))?;
     refuse_renamed(&file)?;
+    let file = if file.contains_key("task") { file } else { on_the_first_run(file)? };
     let sections: Sections = toml_table::read("", file, |_| None)?;
     let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
     let collect: RawCollect = toml_table::read("collect", sections.collect, collect_bounds)?;
@@ -75,6 +76,23 @@ pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
         None => config.derived_episodes(),
     };
     Ok(config)
+}
+
+/// A file without a task changes keys of the first run.
+fn on_the_first_run(file: Table) -> Result<Table, ConfigError> {
+    let text = RunConfig::default().to_toml()?;
+    let mut base: Table = toml::from_str(&text).map_err(|error| ConfigError(error.to_string()))?;
+    // Derived, also from what the file says.
+    if let Some(Value::Table(collect)) = base.get_mut("collect") {
+        collect.remove("episodes_per_iteration");
+    }
+    for (name, section) in file {
+        match (base.get_mut(&name), section) {
+            (Some(Value::Table(base)), Value::Table(section)) => base.extend(section),
+            (_, other) => drop(base.insert(name, other)),
+        }
+    }
+    Ok(base)
 }
 
 /// Where a text is no TOML. The parser's words are kept where they speak of TOML.

@@ -3,10 +3,32 @@ use super::*;
 use crate::task::TaskName;
 
 #[test]
-fn an_empty_file_is_the_default_run() {
+fn an_empty_file_is_the_first_run_and_one_without_a_task_changes_it() {
     let config = RunConfig::from_toml("").unwrap();
     assert_eq!(config, RunConfig::default());
     assert_eq!(RunConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config);
+    let written_out = include_str!("../../../../deploy/configs/spread-50.toml");
+    assert_eq!(RunConfig::from_toml(written_out).unwrap(), config);
+    let changed = RunConfig::from_toml("[run]\nseed = 7\n[collect]\nshards_per_iteration = 6").unwrap();
+    let mut expected = config;
+    (expected.run.seed, expected.collect) = (7, CollectConfig { episodes_per_iteration: 6, shards_per_iteration: 6 });
+    assert_eq!(changed, expected);
+    // With a task, the documented defaults.
+    let other = RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 50\nspawn = 'lines'").unwrap();
+    assert_eq!((other.run, other.mappo), (RunSection::default(), MappoConfig::default()));
+    let error = |text| RunConfig::from_toml(text).unwrap_err().to_string();
+    assert!(error("[mappo]\nalpha = 1").contains("mappo.alpha"));
+    assert!(error("run = 3").contains("run"));
+}
+
+#[test]
+fn the_weights_that_a_run_begins_from_are_a_hash() {
+    let text = |hash: &str| format!("[run]\ninitial_weights = '{hash}'");
+    assert!(RunConfig::from_toml(&text(&"0a".repeat(32))).is_ok());
+    for wrong in ["0a", &"0g".repeat(32)] {
+        let error = RunConfig::from_toml(&text(wrong)).unwrap_err().to_string();
+        assert!(error.contains("run.initial_weights") && error.contains("SHA-256"), "{error}");
+    }
 }
 
 #[test]

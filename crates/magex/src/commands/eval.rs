@@ -8,7 +8,7 @@ use crate::output::{Table, note, seconds};
 use crate::settings;
 use magex_core::config::SEED_MAX;
 use magex_core::ids::Mode;
-use magex_core::metrics_table::METRICS;
+use magex_core::metrics_table::{METRICS, Metric};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_core::trajectory::EpisodeMetrics;
 use magex_learner::report::means::{EvalSummary, summarise};
@@ -180,6 +180,7 @@ fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {
 /// The numbers of a row: episodes, then the metrics of the task.
 fn cells(task: &TaskConfig, [spawn, seed]: [String; 2], mode: Mode, summary: &EvalSummary) -> Vec<String> {
     let metrics = METRICS.iter().zip(summary.means).filter(|(metric, _)| metric.applies(task));
-    let values = metrics.map(|(metric, mean)| mean.map_or_else(String::new, |mean| metric.write(mean)));
+    let written = |metric: &Metric, mean: f64| metric.write_within(mean, task.horizon);
+    let values = metrics.map(|(metric, mean)| mean.map_or_else(String::new, |mean| written(metric, mean)));
     [spawn, seed, mode_name(mode).into(), summary.episodes.to_string()].into_iter().chain(values).collect()
 }

@@ -12,7 +12,7 @@ use crate::supervise::{self, ActorPlan, ServicesPlan, TrainEnd};
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
-use magex_core::metrics_table::{METRICS, SUCCESS_RATE};
+use magex_core::metrics_table::{METRICS, Metric, NEVER, SUCCESS_RATE};
 use magex_learner::report::records::Summary;
 use magex_learner::run_folder::{Claim, RunFolderState};
 use magex_learner::run_start::Parent;
@@ -53,6 +53,9 @@ Exit codes: 0 success, 1 training failed, 64 wrong usage or configuration, 69 th
 
 /// Threads of this process besides those that train.
 const OWN_THREADS: usize = 4;
+
+/// Success of a run that has learned next to nothing.
+const LITTLE: f64 = 0.1;
 
 /// The name of this process in the lock of a run folder.
 const COMMAND: &str = "magex train";
@@ -119,10 +122,11 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
     let (started, output) = (Instant::now(), options.output());
     let args = &args.with_folder()?;
 
-    let (config, parent) = read(args)?;
+    let configured = read(args)?;
+    let config = &configured.config;
     if args.print_config {
         output.say(config.to_toml()?.trim_end());
-        output.result(&as_json(&config)?);
+        output.result(&as_json(config)?);
         return Ok(exit::OK);
     }
 
@@ -131,7 +135,7 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
     // Before anything is created: from here on a signal leaves a run that can be resumed.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let interrupted = runtime.block_on(async { shutdown::on_signal_or_hangup() })?;
-    let plan = prepare(args, config, parent)?;
+    let plan = prepare(args, configured)?;
     let mut progress = Progress::start(&plan.config, &plan.title, &plan.folder.display().to_string());
     let end = train(&plan, &runtime, interrupted, &mut progress);
     runtime.shutdown_background();
@@ -154,9 +158,17 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
 
 // --- Read -------------------------------------------------------------------------------------------------------------
 
+/// What the files and options say.
+struct Configured {
+    config: RunConfig,
+    parent: Option<Parent>,
+    /// The budget before an option changed it.
+    whole_budget: u64,
+}
+
 /// Defaults < file < options. A resumed run continues with its own configuration in place of the defaults, one that begins from
 /// the weights of another run with that run's.
-fn read(args: &TrainArgs) -> anyhow::Result<(RunConfig, Option<Parent>)> {
+fn read(args: &TrainArgs) -> anyhow::Result<Configured> {
     let resumed = args.out.as_deref().filter(|_| args.resume);
     if let Some(folder) = resumed.filter(|folder| !folder.exists()) {
         return Err(usage(format!("--out {} does not exist: leave out --resume to start a new run", folder.display())));
@@ -171,12 +183,13 @@ fn read(args: &TrainArgs) -> anyhow::Result<(RunConfig, Option<Parent>)> {
         (None, Some(own)) => own,
         (None, None) => parent.as_ref().map_or_else(RunConfig::default, Parent::config),
     };
+    let whole_budget = base.run.max_steps;
     let config = args.overrides.apply(base)?;
     let config = match &parent {
         Some(parent) => parent.recorded(config, args.keep_optimiser)?,
         None => config,
     };
-    Ok((config, parent))
+    Ok(Configured { config, parent, whole_budget })
 }
 
 /// By its text: single-precision numbers print as they are written.
@@ -202,10 +215,13 @@ struct Plan {
     /// The actor processes; `None` to train in this process.
     actors: Option<ActorPlan>,
     title: String,
+    /// The budget before an option changed it.
+    whole_budget: u64,
 }
 
 /// Checks the options and creates the folder of a new run.
-fn prepare(args: &TrainArgs, config: RunConfig, parent: Option<Parent>) -> anyhow::Result<Plan> {
+fn prepare(args: &TrainArgs, configured: Configured) -> anyhow::Result<Plan> {
+    let Configured { config, parent, whole_budget } = configured;
     let http = (args.http != "off").then(|| args.http.clone());
     if let Some(listen) = &http {
         server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
@@ -226,7 +242,8 @@ fn prepare(args: &TrainArgs, config: RunConfig, parent: Option<Parent>) -> anyho
         let plan = ActorPlan { actors: args.actors, threads: (processors() / args.actors).max(1) };
         (Some(plan), format!("learner, commander and {} actors on this machine", args.actors))
     };
-    Ok(Plan { config, folder, claim: Arc::new(claim), parent, resume: resumed.is_some(), threads, http, actors, title })
+    let (claim, resume) = (Arc::new(claim), resumed.is_some());
+    Ok(Plan { config, folder, claim, parent, resume, threads, http, actors, title, whole_budget })
 }
 
 // --- Run --------------------------------------------------------------------------------------------------------------
@@ -308,7 +325,7 @@ fn train_in_process(
 
     let (events, received) = mpsc::channel();
     trainer.observe(events);
-    let mut collector = LocalCollector::new(&plan.config, plan.threads, stop);
+    let mut collector = LocalCollector::new(&plan.config, plan.threads, stop).showing(progress.live());
     let outcome = std::thread::scope(|scope| {
         let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);
         let training = thread.spawn_scoped(scope, move || trainer.run(&mut collector));
@@ -346,20 +363,32 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
     let s: Summary = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
 
     let sampled = METRICS[SUCCESS_RATE].write(s.episodes.sampled_success_rate.unwrap_or_default());
+    let (run, horizon) = (&plan.config.run, plan.config.task.horizon);
     let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&plan.config.task));
-    let mut rows: Vec<(&str, String)> = metrics
-        .filter_map(|(metric, mean)| Some((metric.label, format!("{} {}", metric.write(mean?), metric.unit))))
-        .collect();
+    let row = |metric: &Metric, mean: f64| match metric.write_within(mean, horizon) {
+        never if never == NEVER => (metric.label, never),
+        value => (metric.label, format!("{value} {}", metric.unit)),
+    };
+    let mut rows: Vec<(&str, String)> = metrics.filter_map(|(metric, mean)| Some(row(metric, mean?))).collect();
     rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
     rows.extend([
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
-        ("wall time", format!("{} ({} with start and closing evaluation)", seconds(s.wall_s), seconds(command_s))),
-        ("weights sha256", s.weights_sha256),
+        ("training time", seconds(s.wall_s)),
+        ("this command", format!("{}, start and closing evaluation included", seconds(command_s))),
     ]);
-    let why = if s.target_reached { "target reached" } else { "budget spent" };
-    output.say(format!("\nDone: {why}. Evaluated on {} episodes with unseen starts:\n", s.final_episodes));
+    let why = match s.target_reached {
+        true => "Done: target reached",
+        false if run.target_success > 1.0 => "Done: budget spent",
+        false => "Budget spent before the target was reached",
+    };
+    output.say(format!("\n{why}. Evaluated on {} episodes with unseen starts:\n", s.final_episodes));
     for (name, value) in rows {
         output.say(format!("  {name:<16} {value}"));
+    }
+    // Beside its name it would be wider than 80 columns.
+    output.say(format!("  SHA-256 of the weights:\n    {}", s.weights_sha256));
+    if let Some(hint) = not_learned(&plan.config, plan.whole_budget, &s) {
+        output.say(format!("\n{hint}"));
     }
     let (magex, out) = (program(), plan.folder.display());
     output.say(format!("\nNext:\n  {magex} eval {out}"));
@@ -377,6 +406,22 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
     }
     output.result(&value);
     Ok(exit::OK)
+}
+
+/// What a run that has learned next to nothing lacks. `whole` is the budget of its configuration file.
+fn not_learned(config: &RunConfig, whole: u64, summary: &Summary) -> Option<String> {
+    let success = summary.episodes.greedy[SUCCESS_RATE].filter(|&success| success < LITTLE)?;
+    let (run, budget) = (&config.run, thousands(config.run.max_steps as f64));
+    let learned = format!("Little was learned: success {}", METRICS[SUCCESS_RATE].write(success));
+    Some(if run.max_steps < whole {
+        let percent = (100 * run.max_steps).div_ceil(whole);
+        let whole = thousands(whole as f64);
+        let decay =
+            if config.mappo.linear_decay { ", and learning rates fall with it (mappo.linear_decay)" } else { "" };
+        format!("{learned}.\nThe budget of {budget} steps is {percent} % of this configuration's {whole}{decay}.")
+    } else {
+        format!("{learned} after {budget} steps.\nA larger budget continues the run: --resume --max-steps M.")
+    })
 }
 
 fn report_stopped(plan: &Plan, output: Output) -> u8 {
