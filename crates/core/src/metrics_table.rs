@@ -3,6 +3,10 @@
 //! Every consumer loops over [`METRICS`]: environments, the wire, validation, metrics.jsonl, summary.json, plots, pages and
 //! tables. A new metric is a row here, the code that computes it, and a row in docs/metrics.md.
 
+mod kind;
+
+pub use kind::{Kind, Look};
+
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Metric {
@@ -27,6 +31,8 @@ pub struct Metric {
     pub progress: bool,
     /// Vertical axis of its plot in curve.svg and on the live page, if it has one.
     pub plot: Option<Scale>,
+    /// What the head of its plot adds to the unit; empty for most.
+    pub remark: &'static str,
     /// Whether a replay lists it beside the episode. (A replay computes arrival and collisions from the states.)
     pub replay: bool,
 }
@@ -77,6 +83,7 @@ const SHARE: Metric = Metric {
     format: Format::Share,
     progress: false,
     plot: None,
+    remark: "",
     replay: false,
 };
 
@@ -116,6 +123,7 @@ pub const METRICS: &[Metric] = &[
         format: Format::Decimals(1),
         progress: true,
         plot: Some(Scale::FromZero),
+        remark: "never counts as horizon + 1",
         ..SHARE
     },
     Metric {
@@ -239,6 +247,12 @@ impl Metric {
         self.sampled != Some(self.name)
     }
 
+    /// Its columns in metrics.jsonl, and what each is of.
+    pub fn series(&self) -> impl Iterator<Item = (&'static str, Kind)> {
+        let greedy = self.greedy().then_some((self.name, Kind::Greedy));
+        greedy.into_iter().chain(self.sampled.map(|column| (column, Kind::Sampled)))
+    }
+
     /// A value as tables show it, in a task with this horizon: an arrival after it never happened.
     pub fn write_within(&self, value: f64, horizon: u32) -> String {
         let never = self.name == METRICS[ARRIVAL_STEP].name && value > f64::from(horizon);
@@ -273,8 +287,7 @@ mod tests {
 
     #[test]
     fn columns_of_metrics_jsonl_have_different_names() {
-        let greedy = METRICS.iter().filter(|metric| metric.greedy()).map(|metric| metric.name);
-        let columns: Vec<&str> = greedy.chain(METRICS.iter().filter_map(|metric| metric.sampled)).collect();
+        let columns: Vec<&str> = METRICS.iter().flat_map(Metric::series).map(|(column, _)| column).collect();
         assert_eq!(columns.iter().collect::<BTreeSet<_>>().len(), columns.len(), "{columns:?}");
         assert_eq!(METRICS[SECOND_COST_RATIO].name, "second_cost_ratio");
         assert!(METRICS.iter().all(|metric| metric.range[0] <= 1.0 && 1.0 <= metric.range[1]), "fixtures are 1");

@@ -10,7 +10,7 @@ mod tests;
 
 use crate::scene::Scene;
 use axum::body::Bytes;
-use magex_core::config::RunConfig;
+use magex_core::config::{COLLISIONS_ANY, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1;
@@ -77,6 +77,7 @@ pub struct RunInfo {
 #[derive(Debug, Default)]
 struct Run {
     run_id: String,
+    folder: String,
     phase: Phase,
     /// How it ended: name of the state, and a reason if there is one.
     end: Option<(&'static str, Option<String>)>,
@@ -127,8 +128,9 @@ impl LivePage {
             "name": task.name.to_string(), "agents": task.agents, "spawn": task.spawn.to_string(),
             "horizon": task.horizon, "executor": config.executor.kind.to_string(),
             "scheduler": config.commander.kind.to_string(), "seed": run.seed, "max_steps": run.max_steps,
-            "target_success": run.target_success, "eval_every": run.eval_every,
-            "max_iterations": config.max_iterations(),
+            "target_success": run.target_success, "target_sampled_success": run.target_sampled_success,
+            "target_collisions": (run.target_collisions < COLLISIONS_ANY).then_some(run.target_collisions), "eval_every": run.eval_every,
+            "max_iterations": config.max_iterations(), "steps_per_iteration": config.steps_per_iteration(),
         });
         Self {
             process: format!("{:016x}", magex_runtime::backoff::random_id()),
@@ -148,7 +150,10 @@ impl LivePage {
 
     /// Loads the metrics that earlier processes of the run wrote. If the file cannot be read, the curves start empty.
     pub fn begin(&self, run_id: &RunId, folder: &Path) {
-        self.change(|run| run.run_id.clone_from(&run_id.0));
+        self.change(|run| {
+            run.run_id.clone_from(&run_id.0);
+            run.folder = folder.display().to_string();
+        });
         let path = folder.join("metrics.jsonl");
         match std::fs::File::open(&path) {
             Ok(file) => std::io::BufReader::new(file).lines().map_while(Result::ok).for_each(|line| self.line(&line)),
@@ -273,7 +278,7 @@ impl LivePage {
             (None, None) => (json!(run.phase), None),
         };
         let mut value = json!({
-            "process": self.process, "revision": revision, "run_id": run.run_id, "name": self.info.name,
+            "process": self.process, "revision": revision, "run_id": run.run_id, "folder": run.folder, "name": self.info.name,
             "learner": self.info.learner, "lease_s": self.info.lease.map(|lease| lease.as_secs_f64()),
             "task": self.task, "state": state, "reason": reason, "version": run.version, "weights_sha256": run.sha256,
             "uptime_s": self.started.elapsed().as_secs_f64(), "latest": run.latest, "summary": run.summary,

@@ -1,53 +1,57 @@
 //! The numbers behind the curves of the page, one row per line of metrics.jsonl.
 
-use magex_core::metrics_table::{METRICS, Scale};
+use crate::plots::{self, LOG_FROM};
+use magex_core::metrics_table::{Kind, Look, Scale};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 /// Limit of stored rows: when it is exceeded, every other row is dropped. A drawn curve has fewer pixels.
 const KEPT: usize = 2048;
 
-/// Columns that are not metrics of episodes: their name and where they are in a line.
-const COLUMNS: [(&str, &str); 17] = [
-    ("iteration", "/iteration"),
-    ("joint_env_steps", "/joint_env_steps"),
-    ("wall_s", "/wall_s"),
-    ("policy_loss", "/executor/policy_loss"),
-    ("value_loss", "/executor/value_loss"),
-    ("entropy", "/executor/entropy"),
-    ("approx_kl", "/executor/approx_kl"),
-    ("actor_grad_norm", "/executor/actor_grad_norm"),
-    ("critic_grad_norm", "/executor/critic_grad_norm"),
-    ("commander_loss", "/commander/loss"),
-    ("commander_entropy", "/commander/entropy"),
-    ("greedy_cost_ratio", "/commander/greedy_cost_ratio"),
-    ("collect_s", "/timing/collect_s"),
-    ("executor_s", "/timing/executor_s"),
-    ("commander_s", "/timing/commander_s"),
-    ("checkpoint_s", "/timing/checkpoint_s"),
-    ("joint_steps_per_s", "/joint_steps_per_s"),
+/// Columns without a plot: their name and where they are in a line.
+const COLUMNS: [(&str, &str); 10] = [
+    ("iteration", "iteration"),
+    ("joint_env_steps", "joint_env_steps"),
+    ("wall_s", "wall_s"),
+    ("commander_entropy", "commander/entropy"),
+    ("greedy_cost_ratio", "commander/greedy_cost_ratio"),
+    ("collect_s", "timing/collect_s"),
+    ("executor_s", "timing/executor_s"),
+    ("commander_s", "timing/commander_s"),
+    ("checkpoint_s", "timing/checkpoint_s"),
+    ("joint_steps_per_s", "joint_steps_per_s"),
 ];
 
-/// The columns of metrics.jsonl for the episode metrics that have a plot.
-fn metric_columns() -> impl Iterator<Item = &'static str> {
-    let plotted = METRICS.iter().filter(|metric| metric.plot.is_some());
-    plotted.flat_map(|metric| [metric.greedy().then_some(metric.name), metric.sampled]).flatten()
+/// Every column and where it is in a line, as a JSON pointer.
+fn columns() -> Vec<(&'static str, String)> {
+    let plotted = plots::all().into_iter().flat_map(|plot| plot.series).map(|one| (one.column, one.place));
+    COLUMNS.into_iter().chain(plotted).map(|(column, place)| (column, format!("/{place}"))).collect()
 }
 
-/// The plots of the episode metrics as the page's script draws them, JSON.
+/// The plots as the page's script draws them, JSON.
 pub(super) fn plots() -> String {
-    let plots = METRICS.iter().filter_map(|metric| {
-        let scale = match metric.plot? {
+    let plots = plots::all().into_iter().map(|plot| {
+        let scale = match plot.scale {
             Scale::Share => json!({ "low": 0, "high": 1, "share": true }),
             Scale::FromOne => json!({ "line": 1 }),
-            Scale::FromZero | Scale::Free => json!({}),
+            Scale::FromZero => json!({ "zero": true }),
+            Scale::Free => json!({}),
         };
-        let series =
-            [(metric.greedy().then_some(metric.name), "greedy evaluation"), (metric.sampled, "training episodes")];
-        let series: Vec<_> = series.iter().filter_map(|(column, title)| column.map(|column| [column, title])).collect();
-        Some(json!({ "name": metric.name, "title": metric.label, "scale": scale, "series": series }))
+        let series = plot.series.iter().map(|one| (one.column, one.kind.look()));
+        let series: Vec<_> = series.map(|(column, Look { class, label, .. })| [column, label, class]).collect();
+        let log = plot.log.then_some(LOG_FROM);
+        json!({ "name": plot.id, "title": plot.title, "unit": plot.unit, "scale": scale, "log": log, "series": series })
     });
     Value::Array(plots.collect()).to_string()
+}
+
+/// The colours of the series as variables of a style sheet.
+pub(super) fn colours(dark: bool) -> String {
+    let looks = Kind::ALL.map(Kind::look).into_iter();
+    looks
+        .map(|look| format!("--{}: {};", look.class, if dark { look.dark } else { look.light }))
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 /// One line; missing values are NaN.
@@ -71,18 +75,24 @@ pub(super) struct Rows<'a> {
 }
 
 /// Rows in order.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Points {
+    columns: Vec<(&'static str, String)>,
     rows: Vec<Row>,
     last: u64,
+}
+
+impl Default for Points {
+    fn default() -> Self {
+        Self { columns: columns(), rows: vec![], last: 0 }
+    }
 }
 
 impl Points {
     pub(super) fn push(&mut self, line: &Value) {
         self.last += 1;
         let number = |value: Option<&Value>| value.and_then(Value::as_f64).map_or(f32::NAN, |x| x as f32);
-        let fixed = COLUMNS.iter().map(|(_, place)| number(line.pointer(place)));
-        let values = fixed.chain(metric_columns().map(|name| number(line.get(name)))).collect();
+        let values = self.columns.iter().map(|(_, place)| number(line.pointer(place))).collect();
         self.rows.push(Row { line: self.last, values });
         if self.rows.len() > KEPT {
             // From the newest backwards, so that the newest stays.
@@ -99,7 +109,7 @@ impl Points {
     pub(super) fn after<'a>(&self, process: &'a str, after: u64) -> Rows<'a> {
         let from = self.rows.partition_point(|row| row.line <= after);
         let rows = self.rows[from..].iter().map(|row| row.values.clone()).collect();
-        let columns = COLUMNS.iter().map(|(name, _)| *name).chain(metric_columns()).collect();
+        let columns = self.columns.iter().map(|(name, _)| *name).collect();
         Rows { process, after, last: self.last, columns, rows }
     }
 }

@@ -22,7 +22,7 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-const PAGE: &str = include_str!("page.html");
+pub(super) const PAGE: &str = include_str!("page.html");
 
 /// Shortest time between two answers to a viewer.
 const GAP: Duration = Duration::from_millis(250);
@@ -35,7 +35,12 @@ impl LivePage {
         self: &Arc<Self>,
         status: impl Fn() -> Option<v1::RunStatus> + Clone + Send + Sync + 'static,
     ) -> Router {
-        let html: Bytes = PAGE.replacen("@METRICS@", &points::plots(), 1).replacen("@SCENE@", SCRIPT, 1).into();
+        let html: Bytes = PAGE
+            .replacen("@LIGHT@", &points::colours(false), 1)
+            .replacen("@DARK@", &points::colours(true), 1)
+            .replacen("@METRICS@", &points::plots(), 1)
+            .replacen("@SCENE@", SCRIPT, 1)
+            .into();
         let policy = policy(&html);
         let (run, rows, latest) = (self.clone(), self.clone(), self.clone());
         let page = move || {

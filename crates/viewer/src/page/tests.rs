@@ -3,6 +3,7 @@
 use super::*;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
+use magex_core::metrics_table::{Kind, METRICS};
 use magex_core::statics::Statics;
 use magex_core::trajectory::{EvalOutcome, Recording, Shape};
 use magex_proto::v1;
@@ -109,13 +110,37 @@ async fn the_page_allows_only_its_own_script_and_style() {
     for word in ["default-src 'none'", "script-src 'sha256-", "style-src 'sha256-", "connect-src 'self'", "nosniff"] {
         assert!(head.contains(word), "{word}: {head}");
     }
-    assert!(!head.contains("unsafe-inline") && !body.contains("@SCENE@") && !body.contains("@METRICS@"));
+    assert!(!head.contains("unsafe-inline"));
+    for place in ["@SCENE@", "@METRICS@", "@LIGHT@", "@DARK@"] {
+        assert!(!body.contains(place), "{place}");
+    }
     // What is asked for is relative; the only address in full is the name of SVG in the icon, which is not fetched.
     assert!(!body.contains("src=") && !body.contains("@import") && !body.contains(" style="));
     assert_eq!(body.matches("<script>").count(), 1);
     assert_eq!(body.replace("http://www.w3.org/2000/svg", "").matches("://").count(), 3, "shown to people only");
     assert!(get(address, "/nothing", "").await.0.starts_with("HTTP/1.1 404"));
     assert!(get(address, "/api/none", "").await.0.starts_with("HTTP/1.1 404"));
+}
+
+#[tokio::test]
+async fn names_and_colours_are_those_of_the_table() {
+    let (_, body) = get(serve(&page()).await, "/", "").await;
+    let (light, dark) = body.split_once(":root[data-theme=\"dark\"]").unwrap();
+    let script = routes::PAGE.split_once("<script>").unwrap().1;
+    for look in Kind::ALL.map(Kind::look) {
+        assert!(light.contains(&format!("--{}: {};", look.class, look.light)), "{look:?}");
+        assert!(dark.contains(&format!("--{}: {};", look.class, look.dark)), "{look:?}");
+        // Where the script has a label or a colour of its own, the two drift apart.
+        assert!(!script.contains(look.light) && !script.contains(look.dark), "{look:?}");
+        assert!(!script.contains(look.label) || !look.label.contains(' '), "{look:?}");
+    }
+    for metric in METRICS.iter().filter(|metric| metric.plot.is_some()) {
+        for (column, kind) in metric.series() {
+            let look = kind.look();
+            assert!(body.contains(&json!([column, look.label, look.class]).to_string()), "{column}");
+        }
+        assert!(body.contains(&format!("\"unit\":\"{}", metric.unit)), "{}", metric.name);
+    }
 }
 
 #[tokio::test]
@@ -129,7 +154,8 @@ async fn the_state_contains_actors_and_ledger() {
     let run = json_of(address, "/api/run").await;
     assert_eq!((&run["state"], &run["version"], &run["points"]), (&json!("waiting_for_actors"), &json!(5), &json!(2)));
     assert_eq!(run["latest"]["iteration"], 2);
-    assert_eq!(run["run_id"], "run");
+    assert_eq!((&run["run_id"], &run["folder"]), (&json!("run"), &json!(folder.path().display().to_string())));
+    assert_eq!(run["task"]["steps_per_iteration"], RunConfig::default().steps_per_iteration());
     let actor = &run["actors"][0];
     assert_eq!((&actor["id"], &actor["leases"], &actor["lag"]), (&json!("one"), &json!(2), &json!(2)));
     assert_eq!(run["ledger"]["residual"], 2.0);
