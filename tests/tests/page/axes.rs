@@ -110,7 +110,7 @@ async fn axes_and_legends_can_be_read_on_a_screen_and_on_a_phone() {
     assert!(browser.text("steps-more").await.contains("to the budget"), "{}", browser.text("steps-more").await);
     assert_eq!(browser.value("document.querySelector('#actors tbody tr').className").await, "late");
 
-    // The end: one hash, starts that are named, and nobody is accused.
+    // The end: one hash, starts that are named, and no actor is late.
     let hash = "ff01449d9ec6a153".repeat(4);
     let summary = json!({ "success_rate": 0.684, "sampled_success_rate": 0.5, "final_episodes": 100, "iterations": 16,
         "weights_sha256": hash, "wall_s": 40.0, "collisions_per_agent_step": 0.01 });
