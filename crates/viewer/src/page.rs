@@ -12,6 +12,7 @@ use crate::scene::Scene;
 use axum::body::Bytes;
 use magex_core::config::{COLLISIONS_ANY, RunConfig};
 use magex_core::ids::RunId;
+use magex_core::metrics_table::as_written;
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1;
 use magex_proto::weights::Weights;
@@ -124,12 +125,16 @@ impl LivePage {
     /// The page of a run.
     pub fn new(config: &RunConfig, info: RunInfo) -> Self {
         let (task, run) = (&config.task, &config.run);
+        // As it was written; null if the run does not end with it.
+        let target = |value: f32, asked: bool| (asked && run.target_success <= 1.0).then(|| as_written(value.into()));
         let words = json!({
             "name": task.name.to_string(), "agents": task.agents, "spawn": task.spawn.to_string(),
             "horizon": task.horizon, "executor": config.executor.kind.to_string(),
             "scheduler": config.commander.kind.to_string(), "seed": run.seed, "max_steps": run.max_steps,
-            "target_success": run.target_success, "target_sampled_success": run.target_sampled_success,
-            "target_collisions": (run.target_collisions < COLLISIONS_ANY).then_some(run.target_collisions), "eval_every": run.eval_every,
+            "target_success": target(run.target_success, run.target_success <= 1.0),
+            "target_sampled_success": target(run.target_sampled_success, run.target_sampled_success > 0.0),
+            "target_collisions": target(run.target_collisions, run.target_collisions < COLLISIONS_ANY),
+            "eval_every": run.eval_every,
             "max_iterations": config.max_iterations(), "steps_per_iteration": config.steps_per_iteration(),
         });
         Self {

@@ -41,6 +41,21 @@ fn status() -> v1::RunStatus {
     }
 }
 
+#[test]
+fn targets_are_shown_as_they_were_written_and_only_if_the_run_ends_with_them() {
+    let mut config = RunConfig::default();
+    let task = |config: &RunConfig| LivePage::new(config, RunInfo::default()).task;
+    let told =
+        |task: &Value| ["target_success", "target_sampled_success", "target_collisions"].map(|key| task[key].clone());
+    assert_eq!(told(&task(&config)), [json!(0.999), json!(0.96), json!(0.04)]);
+    config.run.target_sampled_success = 0.0;
+    config.run.target_collisions = COLLISIONS_ANY;
+    assert_eq!(told(&task(&config)), [json!(0.999), Value::Null, Value::Null]);
+    config = RunConfig::default();
+    config.run.target_success = 2.0;
+    assert_eq!(told(&task(&config)), [Value::Null, Value::Null, Value::Null]);
+}
+
 async fn serve(page: &Arc<LivePage>) -> SocketAddr {
     let listening = http::bind("127.0.0.1:0").await.unwrap();
     let address = listening.address();
