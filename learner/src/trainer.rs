@@ -5,6 +5,7 @@ mod finish;
 mod outcome;
 mod plan;
 mod saving;
+mod target;
 
 use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
@@ -26,9 +27,9 @@ use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::mappo::Mappo;
 use crate::train::stats::UpdateStats;
-use magex_core::config::{RunConfig, RunSection};
+use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, RunId, Shard, WeightsVersion};
-use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, REWARD, SUCCESS_RATE};
+use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::sha256;
 use magex_core::trajectory::{EvalOutcome, ShardResult, Trajectory};
 use magex_proto::v1::{FinishedEvent, IterationEvent};
@@ -335,7 +336,7 @@ impl Trainer {
         if episodes.greedy.is_none() {
             return self.progress.on_target;
         }
-        if reached(&self.config.run, episodes) { self.progress.on_target.saturating_add(1) } else { 0 }
+        if target::reached(&self.config.run, episodes) { self.progress.on_target.saturating_add(1) } else { 0 }
     }
 
     fn update(
@@ -421,16 +422,6 @@ fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
             built => return built.map_err(|error| TrainError::Threads(error.to_string())),
         }
     }
-}
-
-/// Whether the weights are what the run trains for.
-fn reached(run: &RunSection, episodes: &IterationMeans) -> bool {
-    let mean = |summary: Option<EvalSummary>, metric: usize| summary.and_then(|summary| summary.means[metric]);
-    let (success, sampled) = (mean(episodes.greedy, SUCCESS_RATE), mean(episodes.sampled, SUCCESS_RATE));
-    let collisions = mean(episodes.greedy, COLLISIONS_PER_AGENT_STEP).unwrap_or_default();
-    success >= Some(run.target_success.into())
-        && sampled.unwrap_or_default() >= run.target_sampled_success.into()
-        && collisions <= run.target_collisions.into()
 }
 
 /// Which folder this is, whatever its name.

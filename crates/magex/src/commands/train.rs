@@ -374,7 +374,7 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
     rows.extend([
         ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
         ("training time", seconds(s.wall_s)),
-        ("this command", format!("{}, start and closing evaluation included", seconds(command_s))),
+        ("this command", seconds(command_s)),
     ]);
     let why = match s.target_reached {
         true => "Done: target reached",
