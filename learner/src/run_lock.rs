@@ -12,7 +12,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Name of the file. Its lines say which processes hold the lock: `HOST PID COMMAND`, and [`STOPPING`].
+/// Name of the file. Its lines say which processes hold the lock: `HOST PID COMMAND`, and a word when it is stopping.
 pub const LOCK_FILE: &str = ".lock";
 /// The last line after a holder was told to stop.
 const STOPPING: &str = "stopping";
@@ -65,8 +65,8 @@ pub struct RunLock {
 }
 
 impl RunLock {
-    /// Locks an existing folder for `command`. Waits for another holder to end: [`PATIENCE`] if it is stopping,
-    /// otherwise [`GRACE`].
+    /// Locks an existing folder for `command`. Waits for another holder to end: `PATIENCE` if it is stopping,
+    /// otherwise `GRACE`.
     ///
     /// # Errors
     /// The other one does not end, or the lock file cannot be used.

@@ -24,7 +24,7 @@ const REQUESTS: [fn() -> Request; 4] = [
     || (SignalKind::from_raw(PROCESSOR_TIME), "SIGXCPU", false),
 ];
 
-/// A token that SIGINT, SIGTERM, SIGUSR1 or SIGXCPU cancels. A second SIGINT or SIGTERM, later than [`SAME`], ends the process
+/// A token that SIGINT, SIGTERM, SIGUSR1 or SIGXCPU cancels. A second SIGINT or SIGTERM, later than half a second, ends the process
 /// at once with code 130.
 pub fn on_signal() -> std::io::Result<CancellationToken> {
     watch(REQUESTS.iter().map(|request| request()))
