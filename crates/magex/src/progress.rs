@@ -225,7 +225,7 @@ fn until(run: &RunSection) -> String {
     if run.target_collisions < COLLISIONS_ANY {
         goals.push(format!("collisions {}", run.target_collisions));
     }
-    format!("until two evaluations in a row have {},\nor after {budget}", goals.join(", "))
+    format!("ends with {} twice in a row,\nor after {budget}", goals.join(", "))
 }
 
 /// To four decimals, for log lines.
@@ -240,12 +240,10 @@ mod tests {
     #[test]
     fn what_ends_a_run_is_said_first() {
         let mut run = RunSection { max_steps: 1_000_000, ..RunSection::default() };
-        assert_eq!(until(&run), "until two evaluations in a row have success 0.995,\nor after 1,000,000 joint steps");
+        assert_eq!(until(&run), "ends with success 0.995 twice in a row,\nor after 1,000,000 joint steps");
         (run.target_sampled_success, run.target_collisions) = (0.95, 0.05);
         let text = until(&run);
-        assert!(
-            text.starts_with("until two evaluations in a row have success 0.995, sampled 0.95, collisions 0.05,\n")
-        );
+        assert!(text.starts_with("ends with success 0.995, sampled 0.95, collisions 0.05 twice in a row,\n"));
         assert!(text.lines().all(|line| line.len() <= 80));
         run.target_success = 2.0;
         assert_eq!(until(&run), "ends after 1,000,000 joint steps");
