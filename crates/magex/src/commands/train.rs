@@ -381,7 +381,7 @@ fn report_finished(plan: &Plan, started: Instant, progress: &Progress, output: O
         false if run.target_success > 1.0 => "Done: budget spent",
         false => "Budget spent before the target was reached",
     };
-    output.say(format!("\n{why}. Evaluated on {} episodes with unseen starts:\n", s.final_episodes));
+    output.say(format!("\n{why}.\nEvaluated on {} episodes with unseen starts:\n", s.final_episodes));
     for (name, value) in rows {
         output.say(format!("  {name:<16} {value}"));
     }
