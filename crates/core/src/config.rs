@@ -270,8 +270,8 @@ section! {
 
 impl Default for RunConfig {
     /// The first run: Simple Spread with 50 agents, MAGE-X, until the policy is worth keeping, sampled as well as greedy. Rewards of
-    /// the next ten steps decide (γ = 0.9): so contacts are avoided after a third of the steps that γ = 0.99 takes. It is
-    /// deploy/configs/spread-50.toml.
+    /// the next ten steps decide (γ = 0.9), because agents then learn sooner not to collide (docs/results.md, "The first run"). It
+    /// is deploy/configs/spread-50.toml.
     fn default() -> Self {
         Self {
             run: RunSection {
