@@ -3,13 +3,16 @@
 //!
 //! Reading is strict: an unknown key or a value out of range is an error that names the field and the remedy.
 
+mod executor;
 mod raw;
 
 use crate::error::{FieldError, UnknownName, check_range};
 use crate::section::section;
-use crate::task::{Spawn, TaskConfig};
+use crate::task::{RewardTarget, Spawn, TaskConfig};
 use serde::de::IntoDeserializer as _;
 use serde::{Deserialize, Serialize};
+
+pub use executor::{ExecutorConfig, ExecutorKind, Observes};
 
 /// Why a configuration was refused: it is not TOML, or has a key that does not exist, or a value of the wrong type or out of
 /// its range.
@@ -78,64 +81,6 @@ section! {
         initial_weights: String = String::new();
         /// Whether the run begins with the optimiser's state of these weights, too (`--keep-optimiser`).
         initial_optimiser: bool = false;
-    }
-}
-
-/// Architecture of the executor.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ExecutorKind {
-    /// MAGE-X, the reading that we recommend.
-    Magex,
-    /// MAGE-X, the paper's formulas to the letter.
-    MagexLiteral,
-    /// Ablation -Atten.
-    Attention,
-    /// Ablation -MLP.
-    Mlp,
-    /// k nearest neighbours, no graph, no memory.
-    Local,
-}
-
-impl std::fmt::Display for ExecutorKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.serialize(f)
-    }
-}
-
-impl ExecutorKind {
-    /// Whether the weights serve one team size only.
-    pub fn fixed_team_size(self) -> bool {
-        self == Self::Mlp
-    }
-}
-
-section! {
-    /// `[executor]`
-    ExecutorConfig {
-        /// Architecture.
-        kind: ExecutorKind = ExecutorKind::Magex;
-        /// F: feature size of the graph executors.
-        feature_size: usize = 32, 16..=512;
-        /// l_g: blocks of the Graph Encoder.
-        graph_blocks: usize = 2, 1..=8;
-        /// Hidden units of the pair network f_g.
-        pair_hidden: usize = 16, 1..=256;
-        /// Temperature of the straight-through Gumbel softmax.
-        temperature: f32 = 1.0, 0.05..=20.0;
-        /// Layer normalisation of the features that enter the State Extractor.
-        feature_norm: bool = true;
-        /// Hidden units of `local`.
-        hidden: usize = 64, 8..=1024;
-        /// Neighbours of `local`.
-        neighbours: usize = 6, 1..=64;
-    }
-}
-
-impl ExecutorConfig {
-    /// H: width of the memory, 0 for executors without one.
-    pub fn memory(&self) -> usize {
-        if self.kind == ExecutorKind::Local { 0 } else { self.feature_size }
     }
 }
 
@@ -265,6 +210,8 @@ section! {
         adam_epsilon: f64 = 1e-5, 1e-12..=1.0;
         /// Global-norm limit of each network's gradient.
         max_grad_norm: f32 = 10.0, 1e-6..=1e9;
+        /// Whether the importance ratio is that of the joint action of the team (DICG) or of each agent's own.
+        joint_ratio: bool = false;
     }
 }
 
@@ -339,6 +286,13 @@ impl RunConfig {
             return Err(FieldError::new("run.initial_weights", problem));
         }
         self.executor.check_ranges("executor")?;
+        self.executor.check_kind()?;
+        let paid_for_goals = self.task.reward_target == RewardTarget::Goals;
+        if self.executor.kind.flat() && self.executor.observes == Observes::Landmarks && paid_for_goals {
+            let problem = "\"goals\" pays each agent for a goal that executor.observes = \"landmarks\" does not show it; use \
+                           \"team\", or observe goals";
+            return Err(FieldError::new("task.reward_target", problem));
+        }
         self.commander.check_ranges("commander")?;
         self.mappo.check_ranges("mappo")?;
         let (features, chunk, horizon) =

@@ -85,6 +85,18 @@ pub enum ActionCode {
     PerAxis,
 }
 
+/// What the reward pays for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RewardTarget {
+    /// Each agent is paid for its own goals: MAGE-X, and the baselines that get goals.
+    #[default]
+    Goals,
+    /// The team is paid for all targets, whichever agent (or ball) is nearest, and every agent gets the same: the baselines
+    /// without goals.
+    Team,
+}
+
 /// What only one task has, under the key of its section.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -113,6 +125,8 @@ pub struct TaskConfig {
     pub spawn: Spawn,
     /// Raw units of the layout files per world unit (layouts only).
     pub layout_scale: f32,
+    /// What the reward pays for: each agent's own goals, or the team's coverage of all of them.
+    pub reward_target: RewardTarget,
     /// What only this task has.
     #[serde(flatten)]
     pub settings: TaskSettings,
@@ -128,6 +142,7 @@ struct RawTask {
     horizon: Option<u32>,
     spawn: Option<Spawn>,
     layout_scale: Option<f32>,
+    reward_target: RewardTarget,
     /// The task's own section, and whatever else there is.
     #[serde(flatten)]
     sections: Table,
@@ -188,6 +203,7 @@ pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
         horizon: raw.horizon.unwrap_or_else(|| (definition.horizon)(agents, side)),
         spawn,
         layout_scale: raw.layout_scale.unwrap_or_else(|| (definition.layout_scale)(agents)),
+        reward_target: raw.reward_target,
         settings: (definition.read_settings)(side, own)?,
     })
 }
@@ -203,7 +219,9 @@ fn own_section(name: TaskName, key: &str, value: Value) -> Result<Table, FieldEr
             Some(owner) => FieldError::new(field, format!("belongs to {owner}, the task is {name}; remove it")),
             None => FieldError::new(
                 field,
-                format!("unknown key; use name, agents, side, horizon, spawn, layout_scale or the section {own}"),
+                format!(
+                    "unknown key; use name, agents, side, horizon, spawn, layout_scale, reward_target or the section {own}"
+                ),
             ),
         }),
     }
@@ -221,6 +239,7 @@ impl TaskConfig {
             horizon: (definition.horizon)(agents, side),
             spawn,
             layout_scale: (definition.layout_scale)(agents),
+            reward_target: RewardTarget::default(),
             settings: (definition.default_settings)(side),
         }
     }

@@ -20,7 +20,7 @@ use episode::Episode;
 use magex_core::error::FieldError;
 use magex_core::rng::Stream;
 use magex_core::statics::LANDMARKS;
-use magex_core::task::{DroneConfig, TaskConfig};
+use magex_core::task::{DroneConfig, RewardTarget, TaskConfig};
 use model::{Craft, Effects};
 use world::{Drone, Laws};
 
@@ -80,13 +80,14 @@ impl Flight {
         let (n, config) = (3 * task.agents, *task.drones()?);
         let effects = Effects { ground: true, drag: true, downwash: true };
         let dt = 1.0 / f64::from(config.physics_hz);
+        let team = task.reward_target == RewardTarget::Team;
         let states = starts.positions.chunks_exact(n).zip(starts.velocities.chunks_exact(n));
         Ok(Self {
             laws: Laws::new(Craft::CF2X, effects, config.downwash, dt),
             config,
             agents: task.agents,
             hold: config.physics_hz / DroneConfig::COMMANDS_HZ,
-            episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities)).collect(),
+            episodes: states.map(|(positions, velocities)| Episode::new(positions, velocities, team)).collect(),
             landmarks: starts.landmarks().to_vec(),
         })
     }

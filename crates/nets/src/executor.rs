@@ -9,18 +9,33 @@
 //! | `mlp` | one layer on the concatenated observations (ablation "-MLP"); fixed team size | relative | GRU |
 //! | `local` | sum over the k nearest neighbours | relative | none |
 //!
+//! The baselines see the flat observation vector instead of these features:
+//!
+//! | kind | policy | critic | memory |
+//! |---|---|---|---|
+//! | `flat` | MAPPO, IPPO: two hidden layers of the agent's own vector | the same, on vector and state of the team or vector alone | none or GRU |
+//! | `mat` | MAT: transformer, actions decoded agent by agent | on the same encoder | none |
+//! | `mat-dec` | MAT-Dec: the encoder, all agents at once | on the same encoder | none |
+//! | `dicg` | DICG: attention graph, two graph convolutions | that of `flat` | none |
+//!
 //! Where a task has encounters, `magex`, `attention` and `mlp` sum over the k nearest neighbours, too (Encounter Encoder).
 
+mod dicg;
+mod flat;
 mod local;
+mod mat;
+mod memory;
 mod model;
 mod policy;
 mod team;
 
-use crate::features::{FeatureSpec, Features};
+use crate::features::{FeatureSpec, Features, FlatSpec};
 use crate::ops::{Activation, GraphNoise, linear, neighbour_pool};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
+use dicg::DicgNet;
+use flat::FlatNet;
 use local::LocalNet;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
@@ -63,26 +78,36 @@ pub trait Network: Send + Sync {
 
 /// What features the executor of a run wants. The graph executors see single neighbours where the task has encounters.
 pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
+    if config.kind.flat() {
+        let states = config.centralised_critic && matches!(config.kind, ExecutorKind::Flat | ExecutorKind::Dicg);
+        let flat = Some(FlatSpec { observes: config.observes, agent_index: config.agent_index, states });
+        // In the world's axes, as the baselines' authors have it.
+        return FeatureSpec { flat, ..FeatureSpec::new(task, false, 0, false) };
+    }
     let local = config.kind == ExecutorKind::Local;
     let literal = config.kind == ExecutorKind::MagexLiteral;
     let neighbours = if local || (task.observation().encounters && !literal) { config.neighbours } else { 0 };
     FeatureSpec::new(task, !literal, neighbours, !local)
 }
 
-/// Builds an actor or critic with `outputs` outputs; `head_gain` is the orthogonal gain of the last layer
-/// (0.01 for actors, 1 for critics).
+/// An actor or a critic with `outputs` outputs; `head_gain` is the orthogonal gain of the last layer (0.01 for actors, 1 for
+/// critics). Critics of baselines may be `centralised`.
 pub fn build(
     config: &ExecutorConfig,
     spec: &FeatureSpec,
-    outputs: usize,
-    head_gain: f64,
+    (outputs, head_gain): (usize, f64),
+    critic: bool,
     params: &mut ParamBuilder,
 ) -> Result<Box<dyn Network>, ParamError> {
+    use ExecutorKind::{Attention, Dicg, Flat, Local, Magex, MagexLiteral, Mat, MatDec, Mlp};
+    let head = (outputs, head_gain);
     Ok(match config.kind {
-        ExecutorKind::Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, params)?),
-        ExecutorKind::Magex | ExecutorKind::MagexLiteral | ExecutorKind::Attention | ExecutorKind::Mlp => {
-            Box::new(TeamNet::build(config, spec, outputs, head_gain, params)?)
-        }
+        Local => Box::new(LocalNet::build(config, spec, outputs, head_gain, params)?),
+        Magex | MagexLiteral | Attention | Mlp => Box::new(TeamNet::build(config, spec, outputs, head_gain, params)?),
+        Dicg if !critic => Box::new(DicgNet::build(config, spec, head, params)?),
+        Flat | Dicg => Box::new(FlatNet::build(config, spec, head, critic && config.centralised_critic, params)?),
+        // Its policy and its value function are one network.
+        Mat | MatDec => return Err(ParamError::Mismatch("MAT is built as a whole".to_owned())),
     })
 }
 
@@ -144,5 +169,7 @@ impl NeighbourEncoder {
     }
 }
 
+/// Gain of layers followed by tanh.
+pub(crate) const TANH_GAIN: f64 = 5.0 / 3.0;
 /// Gain of layers followed by ReLU.
 pub(crate) const RELU_GAIN: f64 = std::f64::consts::SQRT_2;

@@ -4,8 +4,10 @@
 //! trained with 50 agents serve 20 or 1000. Rows are ordered [.., N]: the N agents of a joint state are neighbours.
 //!
 //! [`Observation`] says in numbers what an agent sees of a task. One task has formulas of its own: those of Push Ball are in
-//! `push`, for tasks in which an agent's way leads to a ball and with it to a landmark.
+//! `push`, for tasks in which an agent's way leads to a ball and with it to a landmark. The baselines see the classical flat
+//! observation vector instead: `flat`.
 
+mod flat;
 mod goal;
 mod neighbours;
 mod push;
@@ -15,6 +17,7 @@ use magex_core::joint_state::JointState;
 use magex_core::task::{Frame, Observation, TaskConfig};
 use magex_core::trajectory::Shape;
 
+pub use flat::FlatSpec;
 pub use symmetry::Symmetry;
 
 /// What a network wants to see.
@@ -30,6 +33,8 @@ pub struct FeatureSpec {
     pub neighbours: usize,
     /// Node and pair features, which the graph executors read.
     pub team: bool,
+    /// The flat observation vector; `None` for networks that see goal, nodes and neighbours.
+    pub flat: Option<FlatSpec>,
     /// Sizes that the features are measured with.
     pub observation: Observation,
 }
@@ -47,6 +52,10 @@ pub struct Features {
     pub neighbours: Vec<f32>,
     /// `[R]` how many of the k are real.
     pub counts: Vec<u8>,
+    /// [R, V] the flat observation vector.
+    pub vectors: Vec<f32>,
+    /// [S, W] the state of the whole team, once per joint state.
+    pub states: Vec<f32>,
     /// `[R]` the frame that each agent sees the world in; empty if that is the world's own.
     pub symmetries: Vec<Symmetry>,
 }
@@ -61,6 +70,7 @@ impl FeatureSpec {
             relative_goal,
             neighbours,
             team,
+            flat: None,
             // The letter of the paper knows no frame but the world's.
             observation: if relative_goal { observation } else { Observation { frame: Frame::World, ..observation } },
         }
@@ -94,7 +104,9 @@ impl FeatureSpec {
         let (count, landmarks) = (states.positions.len() / joint, states.landmarks());
         let episodes = states.goals.len() / (n * self.shape.goals_per_agent);
         let mut out = Features::default();
-        out.goals.reserve(count * n * self.goal_width());
+        if self.flat.is_none() {
+            out.goals.reserve(count * n * self.goal_width());
+        }
         if self.neighbours > 0 {
             out.neighbours = vec![0.0; count * n * self.neighbours * self.neighbour_width()];
             out.counts = vec![0; count * n];
@@ -119,8 +131,12 @@ impl FeatureSpec {
             };
             symmetries.clear();
             symmetries.extend((0..n).map(|i| self.symmetry(&state, i)));
-            for i in 0..n {
-                self.goal_features(&state, i, symmetries[i], &mut out.goals);
+            if let Some(flat) = self.flat {
+                self.flat_features(flat, &state, &mut out);
+            } else {
+                for i in 0..n {
+                    self.goal_features(&state, i, symmetries[i], &mut out.goals);
+                }
             }
             if self.neighbours > 0 {
                 let width = n * self.neighbours * self.neighbour_width();
@@ -223,8 +239,8 @@ fn offset(from: &[f32], to: &[f32]) -> ([f32; 3], f32) {
 }
 
 impl Features {
-    /// Appends the rows `from..from + count` of `other`.
-    pub fn append(&mut self, other: &Self, from: usize, count: usize, rows: usize) {
+    /// Appends the rows `from..from + count` of the `rows` of `other`: whole joint states of N agents.
+    pub fn append(&mut self, other: &Self, (from, count): (usize, usize), rows: usize, agents: usize) {
         fn copy<T: Copy>(to: &mut Vec<T>, source: &[T], from: usize, count: usize, rows: usize) {
             let width = source.len() / rows.max(1);
             to.extend_from_slice(&source[from * width..(from + count) * width]);
@@ -235,6 +251,8 @@ impl Features {
         copy(&mut self.neighbours, &other.neighbours, from, count, rows);
         copy(&mut self.counts, &other.counts, from, count, rows);
         copy(&mut self.symmetries, &other.symmetries, from, count, rows);
+        copy(&mut self.vectors, &other.vectors, from, count, rows);
+        copy(&mut self.states, &other.states, from / agents, count / agents, rows / agents);
     }
 }
 

@@ -5,6 +5,7 @@
 //! docs/dependencies.md lists why each operation is ours and when it may go.
 
 mod action_log_probs;
+mod attention;
 mod elementwise;
 mod graph;
 mod gru;
@@ -17,12 +18,17 @@ mod pool;
 mod simd;
 
 pub use action_log_probs::action_log_probs;
-pub use elementwise::{exp, softmax, tanh};
+pub use attention::{Attention, attention};
+pub(crate) use attention::{Keys, attend};
+pub(crate) use elementwise::gelu_in_place;
+pub use elementwise::{exp, gelu, softmax, tanh};
 pub use graph::{GraphBlock, GraphNoise, graph_block};
 pub use gru::gru;
 pub use linear::linear;
 pub use matmul::Activation;
+pub(crate) use matmul::{Packed, matmul};
 pub use norm::layer_norm;
+pub(crate) use norm::layer_norm_in_place;
 pub(crate) use picks::{Mask, MaskedSoftmax};
 pub use picks::{Pick, PickTable, pick_log_probs};
 pub use pool::{mean_of_others, neighbour_pool};

@@ -55,6 +55,30 @@ fn check(vars: &[&Var], f: &dyn Fn() -> Tensor) {
 }
 
 #[test]
+fn attention_and_gelu() {
+    for (heads, causal) in [(1, false), (2, true), (4, true)] {
+        let [q, k, v] = [1, 2, 3].map(|tag| var(&[15, 8], tag));
+        let shape = ops::Attention { agents: 5, heads, causal, scale: 0.5 };
+        check(&[&q, &k, &v], &|| ops::attention(&q, &k, &v, shape).unwrap());
+        // The same by candle's own operations.
+        let split =
+            |x: &Var| x.reshape((3, 5, heads, 8 / heads)).unwrap().transpose(1, 2).unwrap().contiguous().unwrap();
+        let scores = (split(&q).matmul(&split(&k).t().unwrap().contiguous().unwrap()).unwrap() * 0.5).unwrap();
+        let hidden: Vec<f32> =
+            (0..25).map(|at| if causal && at % 5 > at / 5 { f32::NEG_INFINITY } else { 0.0 }).collect();
+        let mask = Tensor::from_vec(hidden, (1, 1, 5, 5), &Device::Cpu).unwrap();
+        let weights = candle_nn::ops::softmax_last_dim(&scores.broadcast_add(&mask).unwrap()).unwrap();
+        let mixed = weights.matmul(&split(&v)).unwrap().transpose(1, 2).unwrap().reshape((15, 8)).unwrap();
+        let gap = (mixed - ops::attention(&q, &k, &v, shape).unwrap()).unwrap().abs().unwrap();
+        assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
+    }
+    let x = var(&[3, 21], 4);
+    check(&[&x], &|| ops::gelu(&x).unwrap());
+    let gap = (ops::gelu(&x).unwrap() - x.gelu().unwrap()).unwrap().abs().unwrap();
+    assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
+}
+
+#[test]
 fn linear_and_norm() {
     let (x, w, b) = (var(&[6, 5], 1), var(&[5, 7], 2), var(&[7], 3));
     for act in [Activation::Identity, Activation::Relu, Activation::Tanh] {
@@ -235,7 +259,7 @@ fn drawn(name: TaskName, kind: ExecutorKind, agents: usize, outputs: usize) -> (
     let config = ExecutorConfig { kind, neighbours: 3, ..ExecutorConfig::default() };
     let task = TaskConfig::of(name, agents, Spawn::Uniform);
     let mut params = ParamBuilder::layout();
-    build(&config, &feature_spec(&config, &task), outputs, 1.0, &mut params).unwrap();
+    build(&config, &feature_spec(&config, &task), (outputs, 1.0), false, &mut params).unwrap();
     let params = Params::init(params.entries(), Key::new(3, Purpose::Init, &[0]).stream());
     (config, task, params)
 }
@@ -248,6 +272,8 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         ExecutorKind::Attention,
         ExecutorKind::Mlp,
         ExecutorKind::Local,
+        ExecutorKind::Flat,
+        ExecutorKind::Dicg,
     ];
     for (name, kind) in TASKS.into_iter().flat_map(|name| kinds.map(|kind| (name, kind))) {
         let (steps, sequences, agents) = (4, 3, 6);
@@ -256,7 +282,7 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         let states = States::new(&task, steps * sequences);
         let features = spec.compute(&states.part(&task, 0, steps * sequences));
         let output = |tensors: Vec<Tensor>| {
-            let net = build(&config, &spec, 5, 1.0, &mut ParamBuilder::with(tensors)).unwrap();
+            let net = build(&config, &spec, (5, 1.0), false, &mut ParamBuilder::with(tensors)).unwrap();
             let input = Input {
                 steps,
                 sequences,
@@ -305,12 +331,19 @@ fn hard_edges(kind: ExecutorKind) -> bool {
 
 #[test]
 fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
-    let kinds = [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Mlp, ExecutorKind::Local];
+    let kinds = [
+        ExecutorKind::Magex,
+        ExecutorKind::MagexLiteral,
+        ExecutorKind::Mlp,
+        ExecutorKind::Local,
+        ExecutorKind::Flat,
+        ExecutorKind::Dicg,
+    ];
     for (name, kind) in TASKS.into_iter().flat_map(|name| kinds.map(|kind| (name, kind))) {
         let (count, agents) = (7, 9);
         let (config, task, params) = drawn(name, kind, agents, 5);
         let spec = feature_spec(&config, &task);
-        let net = build(&config, &spec, 5, 1.0, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
+        let net = build(&config, &spec, (5, 1.0), false, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
         let states = States::new(&task, count);
         let run = |from: usize, to: usize| {
             let features = spec.compute(&states.part(&task, from, to));

@@ -2,11 +2,11 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use candle_core::{Result, Tensor, Var};
-use magex_core::config::RunConfig;
+use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
 use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
-use magex_core::task::{Spawn, TaskConfig};
+use magex_core::task::{RewardTarget, Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{Chooser, Evaluated, Input, Model, Policy};
 use magex_nets::features::Features;
@@ -162,28 +162,122 @@ fn earlier_actions_of_a_decoder_reach_later_agents_and_evaluation_agrees_with_ac
     }
 }
 
+/// The policies whose acting and evaluating must agree: MAGE-X and every baseline.
+fn configs() -> Vec<RunConfig> {
+    let baseline = |kind, recurrent| {
+        let mut config = config();
+        config.task.reward_target = RewardTarget::Team;
+        config.executor = ExecutorConfig { kind, recurrent, hidden: 32, attention_heads: 1, ..config.executor };
+        config
+    };
+    let mut several = baseline(ExecutorKind::Mat, false);
+    (several.executor.attention_blocks, several.executor.attention_heads) = (2, 4);
+    vec![
+        config(),
+        baseline(ExecutorKind::Flat, false),
+        baseline(ExecutorKind::Flat, true),
+        baseline(ExecutorKind::Mat, false),
+        several,
+        baseline(ExecutorKind::MatDec, false),
+        baseline(ExecutorKind::Dicg, false),
+    ]
+}
+
+fn drawn(model: &Model) -> Vec<Params> {
+    let stream = |k: u32| Key::new(2, Purpose::Init, &[k]).stream();
+    model.layouts().unwrap().into_iter().zip(0..).map(|(layout, k)| Params::init(layout, stream(k))).collect()
+}
+
 #[test]
 fn a_loaded_policy_acts_as_the_one_that_was_written_and_evaluation_agrees_with_acting() {
-    let config = config();
-    let model = Model::new(&config).unwrap();
+    for config in configs() {
+        let model = Model::new(&config).unwrap();
+        let features = features(&model, &config.task);
+        let params = drawn(&model);
+        let builder = |params: &Params| ParamBuilder::with(params.tensors().unwrap());
+        let own = model.policy(&mut params.iter().map(builder).collect::<Vec<_>>()).unwrap();
+        // Actors are sent what the policy reads, and nothing else.
+        let published = model.parts().iter().zip(&params).filter(|(part, _)| part.policy);
+        let published: Vec<(&str, &Params)> = published.map(|(part, params)| (part.name, params)).collect();
+        let loaded = model.load_policy(&to_safetensors(&published, "").unwrap()).unwrap();
+        let flat = |states: Option<Tensor>| states.map(|s| s.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        let act = |policy: &dyn Policy| {
+            let mut sampler = Sampler::new(model.heads(), STATES, AGENTS, None);
+            let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap();
+            (sampler.actions, sampler.log_probs, flat(states))
+        };
+        let (actions, log_probs, states) = act(own.as_ref());
+        assert_eq!(act(loaded.as_ref()), (actions.clone(), log_probs.clone(), states.clone()));
+        let evaluated = own.evaluate(&input(&features, model.memory()), &actions).unwrap();
+        let kind = config.executor.kind;
+        assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), log_probs, "{kind}");
+        assert_eq!(flat(evaluated.states), states, "{kind}");
+    }
+}
+
+#[test]
+fn a_decoding_transformer_hears_the_agents_before_and_no_agent_after() {
+    let config = &configs()[4];
+    let model = Model::new(config).unwrap();
     let features = features(&model, &config.task);
-    let stream = |k: u32| Key::new(2, Purpose::Init, &[k]).stream();
-    let params: Vec<Params> =
-        model.layouts().unwrap().into_iter().zip(0..).map(|(layout, k)| Params::init(layout, stream(k))).collect();
-    let builder = |params: &Params| ParamBuilder::with(params.tensors().unwrap());
-    let own = model.policy(&mut params.iter().map(builder).collect::<Vec<_>>()).unwrap();
-    // Actors are sent what the policy reads, and nothing else.
-    let published = model.parts().iter().zip(&params).filter(|(part, _)| part.policy);
-    let published: Vec<(&str, &Params)> = published.map(|(part, params)| (part.name, params)).collect();
-    let loaded = model.load_policy(&to_safetensors(&published, "").unwrap()).unwrap();
-    let act = |policy: &dyn Policy| {
-        let mut sampler = Sampler::new(model.heads(), STATES, AGENTS, None);
-        let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap().unwrap();
-        (sampler.actions, sampler.log_probs, states.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+    let mut params = drawn(&model);
+    // Heads start near zero; make what is said audible.
+    params[0].values.iter_mut().for_each(|x| *x = if x.abs() < 0.2 { *x * 20.0 } else { *x });
+    let mut parts = [ParamBuilder::with(params[0].tensors().unwrap())];
+    let policy = model.policy(&mut parts).unwrap();
+    let evaluate = |actions: &[u8]| -> Vec<f32> {
+        policy.evaluate(&input(&features, 0), actions).unwrap().entropies.to_vec1().unwrap()
     };
-    let (actions, log_probs, states) = act(own.as_ref());
-    assert_eq!(act(loaded.as_ref()), (actions.clone(), log_probs.clone(), states.clone()));
-    let evaluated = own.evaluate(&input(&features, model.memory()), &actions).unwrap();
-    assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), log_probs);
-    assert_eq!(evaluated.states.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap(), states);
+    let base = evaluate(&[0; STATES * AGENTS]);
+    for changed in 0..AGENTS {
+        let mut actions = [0; STATES * AGENTS];
+        actions.iter_mut().skip(changed).step_by(AGENTS).for_each(|action| *action = 3);
+        let other = evaluate(&actions);
+        for (row, (a, b)) in base.iter().zip(&other).enumerate() {
+            assert_eq!(a == b, row % AGENTS <= changed, "agent {changed}, row {row}");
+        }
+    }
+}
+
+#[test]
+fn the_gradient_of_the_transformer_is_its_slope_in_every_tensor() {
+    let config = &configs()[4];
+    let model = Model::new(config).unwrap();
+    let features = features(&model, &config.task);
+    let mut params = drawn(&model).remove(0);
+    params.values.iter_mut().for_each(|x| *x = if x.abs() < 0.2 { *x * 20.0 } else { *x });
+    let actions: Vec<u8> = (0..STATES * AGENTS).map(|row| (row * 7 % 5) as u8).collect();
+    // Both ways through the network: log-probabilities and entropies, and values.
+    let loss = |tensors: &[Tensor]| -> Tensor {
+        let part = || [ParamBuilder::with(tensors.to_vec())];
+        let now = model.policy(&mut part()).unwrap().evaluate(&input(&features, 0), &actions).unwrap();
+        let values = model.value(&mut part()).unwrap().forward(&input(&features, 0)).unwrap().out;
+        let probe = ops::constant(normal(STATES * AGENTS, 9), 1).unwrap();
+        let policy = ((now.log_probs + now.entropies).unwrap() * probe.flatten_all().unwrap()).unwrap();
+        (policy.sum_all().unwrap() + (values * probe).unwrap().sum_all().unwrap()).unwrap()
+    };
+    let vars = params.variables().unwrap();
+    let tensors: Vec<Tensor> = vars.iter().map(|v| v.as_tensor().clone()).collect();
+    let gradient = params.gradient(&vars, &loss(&tensors).backward().unwrap()).unwrap();
+    for entry in params.entries.clone() {
+        let own = &gradient[entry.range()];
+        let largest = (0..own.len()).max_by(|&a, &b| own[a].abs().total_cmp(&own[b].abs())).unwrap();
+        // A shift of all keys changes no attention weight.
+        if !entry.name.ends_with("key.bias") {
+            assert!(own[largest] != 0.0, "{} has no gradient", entry.name);
+        }
+        let at = entry.start + largest;
+        let mut moved = |step: f32| {
+            let before = params.values[at];
+            params.values[at] += step;
+            let value = loss(&params.tensors().unwrap()).to_scalar::<f32>().unwrap();
+            params.values[at] = before;
+            f64::from(value)
+        };
+        let slopes = [3e-3, 1e-3].map(|step| (moved(step) - moved(-step)) / f64::from(2.0 * step));
+        let close = slopes
+            .iter()
+            .any(|slope| (slope - f64::from(own[largest])).abs() < 0.05 * f64::from(own[largest].abs()) + 0.02);
+        assert!(close, "{}: {slopes:?} and {}", entry.name, own[largest]);
+    }
 }

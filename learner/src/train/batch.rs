@@ -64,7 +64,7 @@ impl Batch {
         let mut out = Features::default();
         for l in 0..steps {
             for &(episode, start) in units {
-                out.append(&self.features[episode], (start + l) * n, n, rows);
+                out.append(&self.features[episode], ((start + l) * n, n), rows, n);
             }
         }
         out

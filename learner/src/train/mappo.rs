@@ -9,7 +9,7 @@
 //! | 4 | advantages by GAE(λ), normalised over the whole batch: (A − mean) / (deviation + 1e-5) | `r_mappo.py`, `train` |
 //! | 5 | few epochs, large minibatches | sections 5.3 and 5.5 |
 //! | 6 | memories are differentiated through chunks of L steps; each chunk enters with the memory of the rollout | appendix; `recurrent_generator` |
-//! | 7 | clipped surrogate over the action of one agent | section 5.4; Schulman et al. 2017, equation 7 |
+//! | 7 | clipped surrogate over the action of one agent (or, with `joint_ratio`, of the team) | section 5.4; Schulman et al. 2017, equation 7 |
 //! | 8 | clipped value loss around the old value, Huber loss with δ = 10 | `cal_value_loss` |
 //! | 9 | entropy bonus; gradient clipped by its global norm, network by network | `ppo_update` |
 //! | 10 | orthogonal initialisation, gain 0.01 in the last layer of the policy | `r_actor_critic.py` |
@@ -225,13 +225,22 @@ impl Mappo {
         let now = policy.evaluate(&slice.input(&slice.features(), hidden, slice.noise()), &slice.actions())?;
 
         let log_ratio = (now.log_probs - slice.column(&slice.batch.log_probs)?)?;
+        let (log_ratio, advantages, entropies, agents) = if m.joint_ratio {
+            let agents = slice.batch.shape.agents;
+            let mean = |x: &Tensor| sum_of_agents(x, agents)? / agents as f64;
+            let (advantages, entropies) = (mean(&slice.column(advantages)?)?, mean(&now.entropies)?);
+            (sum_of_agents(&log_ratio, agents)?, advantages, entropies, agents)
+        } else {
+            (log_ratio, slice.column(advantages)?, now.entropies, 1)
+        };
         let ratio = ops::exp(&log_ratio)?;
-        let surrogate = clipped_surrogate(&ratio, &slice.column(advantages)?, m.clip_epsilon)?;
+        let surrogate = clipped_surrogate(&ratio, &advantages, m.clip_epsilon)?;
         // Means over the whole minibatch, so that the gradients of its slices add up.
-        let objective = (&surrogate + (&now.entropies * f64::from(m.entropy_coef))?)?;
-        let loss = (objective.sum_all()? * (-1.0 / f64::from(slice.samples)))?;
+        let objective = (&surrogate + (&entropies * f64::from(m.entropy_coef))?)?;
+        let weight = agents as f64;
+        let loss = (objective.sum_all()? * (-weight / f64::from(slice.samples)))?;
 
-        let sums = PolicySums::of(&surrogate, &now.entropies, &ratio, &log_ratio, m.clip_epsilon)?;
+        let sums = PolicySums::of(&surrogate, &entropies, &ratio, &log_ratio, m.clip_epsilon)?.times(weight);
         Ok((gradients(networks, &variables, &loss)?, sums))
     }
 
@@ -270,6 +279,13 @@ impl Mappo {
         let builders = variables.iter().map(builder).collect();
         Ok((variables, builders))
     }
+}
+
+/// Σ over the N agents of each joint state: `[S·N]` → `[S]`.
+fn sum_of_agents(x: &Tensor, agents: usize) -> CandleResult<Tensor> {
+    // A product with ones: candle's sum has another order on another instruction set.
+    let (ones, zero) = (ops::constant(vec![1.0; agents], 1)?, column(vec![0.0])?);
+    ops::linear(&x.reshape(((), agents))?, &ones, &zero, ops::Activation::Identity, false)?.flatten_all()
 }
 
 /// min(ρ A, clip(ρ, 1 ± ε) A), element by element.
@@ -320,6 +336,12 @@ impl PolicySums {
             sums.ratio_error = sums.ratio_error.max(f64::from((ratio - 1.0).abs()));
         }
         Ok(sums)
+    }
+
+    /// Of rows that stand for several samples each.
+    fn times(self, weight: f64) -> Self {
+        let Self { loss, entropy, clipped, kl, ratio_error } = self;
+        Self { loss: loss * weight, entropy: entropy * weight, clipped: clipped * weight, kl: kl * weight, ratio_error }
     }
 
     fn add(&mut self, other: &Self) {

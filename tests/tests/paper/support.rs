@@ -42,7 +42,7 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
     let mappo = Mappo::new(config).unwrap();
     let n = config.task.agents;
     let mut params = ParamBuilder::with(actor(&mappo).tensors().unwrap());
-    let network = executor::build(&config.executor, mappo.spec(), 5, 0.01, &mut params).unwrap();
+    let network = executor::build(&config.executor, mappo.spec(), (5, 0.01), false, &mut params).unwrap();
     let statics = Statics::landmarks(n, 2, (0..2 * n).map(|k| 0.3 * k as f32).collect());
     let goals: Vec<u32> = (0..n as u32).collect();
     let velocities = vec![0.0; positions.len()];

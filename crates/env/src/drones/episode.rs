@@ -14,7 +14,10 @@ pub(super) struct Episode {
     memories: Vec<Memory>,
     /// Target velocities, m/s.
     targets: Vec<V3>,
-    /// Distance of each drone to its landmark before the command, m; meaningless before the first one.
+    /// The team is paid: the drone nearest to each landmark counts, whatever the goals are.
+    team: bool,
+    /// Distance of each drone to its landmark before the command, m; for the team, of each landmark to the drone nearest to it.
+    /// Meaningless before the first command.
     before: Vec<f64>,
     /// Whether each drone was out before the command.
     was_out: Vec<bool>,
@@ -30,7 +33,7 @@ fn vector(values: &[f32]) -> V3 {
 
 impl Episode {
     /// Level drones; `positions` and `velocities` are `[N, 3]`.
-    pub(super) fn new(positions: &[f32], velocities: &[f32]) -> Self {
+    pub(super) fn new(positions: &[f32], velocities: &[f32], team: bool) -> Self {
         let state = |(position, velocity): (&[f32], &[f32])| State {
             position: vector(position),
             attitude: [0.0, 0.0, 0.0, 1.0],
@@ -44,6 +47,7 @@ impl Episode {
             world: World::new(drones),
             memories: vec![Memory::default(); n],
             targets: velocities.chunks_exact(3).map(|v| limited(vector(v))).collect(),
+            team,
             before: vec![0.0; n],
             was_out: vec![false; n],
             rpm: vec![[0.0; 4]; n],
@@ -61,6 +65,18 @@ impl Episode {
     fn distance(&self, i: usize, goals: &[u32], landmarks: &[f32]) -> f64 {
         let goal = goals[i] as usize;
         norm(sub(self.place(i), vector(&landmarks[3 * goal..3 * goal + 3])))
+    }
+
+    /// Distance of the i-th drone to its landmark, or for the team of the i-th landmark to the nearest drone that flies; where
+    /// none does it stays what it was.
+    fn paid_distance(&self, i: usize, goals: &[u32], landmarks: &[f32]) -> f64 {
+        if !self.team {
+            return self.distance(i, goals, landmarks);
+        }
+        let landmark = vector(&landmarks[3 * i..3 * i + 3]);
+        let flying = (0..goals.len()).filter(|&j| !self.world.drones[j].is_out());
+        let nearest = flying.map(|j| norm(sub(self.place(j), landmark))).fold(f64::INFINITY, f64::min);
+        if nearest.is_finite() { nearest } else { self.before[i] }
     }
 
     fn place(&self, i: usize) -> V3 {
@@ -95,30 +111,40 @@ impl Episode {
     /// Notes what the reward of the command to come compares with.
     pub(super) fn prepare(&mut self, goals: &[u32], landmarks: &[f32]) {
         for i in 0..goals.len() {
-            self.before[i] = self.distance(i, goals, landmarks);
+            self.before[i] = self.paid_distance(i, goals, landmarks);
             self.was_out[i] = self.world.drones[i].is_out();
         }
     }
 
     /// Rewards of the command just executed, `[N]`.
     pub(super) fn pay(&mut self, config: &DroneConfig, goals: &[u32], landmarks: &[f32], rewards: &mut [f32]) {
+        let mut total = 0.0;
         for (i, reward) in rewards.iter_mut().enumerate() {
             *reward = 0.0;
+            // What the way to a landmark earns is an agent's own, or the team's.
+            let mut sum = 0.0;
+            if self.team || !self.was_out[i] {
+                let distance = self.paid_distance(i, goals, landmarks);
+                sum += f64::from(config.progress) * (self.before[i] - distance);
+                sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };
+            }
             if self.was_out[i] {
+                total += sum;
                 continue;
             }
             let crashed = self.world.drones[i].is_out();
-            let distance = self.distance(i, goals, landmarks);
             let others = (0..self.world.drones.len()).filter(|&j| j != i && !self.world.drones[j].is_out());
             let nearest = others.map(|j| norm(sub(self.place(i), self.place(j)))).fold(f64::INFINITY, f64::min);
             let closeness = (1.0 - nearest / f64::from(config.proximity_radius)).max(0.0);
-            let mut sum = f64::from(config.progress) * (self.before[i] - distance);
-            sum += if distance <= COVER_RADIUS { f64::from(config.bonus) } else { 0.0 };
             sum -= if crashed { f64::from(config.crash) } else { 0.0 };
             sum -= f64::from(config.proximity) * closeness;
             sum -= f64::from(config.tilt) * steepness(f64::from(self.world.drones[i].upright()));
             *reward = sum as f32;
-            self.reward += sum;
+            total += sum;
+        }
+        self.reward += total;
+        if self.team {
+            rewards.fill((total / rewards.len() as f64) as f32);
         }
     }
 

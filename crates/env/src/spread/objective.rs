@@ -6,7 +6,7 @@ use crate::particles::constants::CONTACT_DISTANCE;
 use crate::particles::physics::{Alike, Pair, Physics};
 use crate::particles::swarm::Swarm;
 use magex_core::error::FieldError;
-use magex_core::task::TaskConfig;
+use magex_core::task::{RewardTarget, TaskConfig};
 
 /// A landmark is covered when an agent's centre is within this distance (agent radius 0.1 + landmark radius 0.05).
 pub const COVER_RADIUS: f64 = 0.15;
@@ -20,7 +20,9 @@ pub(crate) struct SpreadObjective<const W: usize> {
     collision: f32,
     /// COVER_RADIUS².
     cover2: f32,
-    /// Where each agent's goal is.
+    /// The team is paid: the nearest agent of each landmark counts, whatever the goals are.
+    team: bool,
+    /// Where each agent's goal is; for the team, where each landmark is.
     gx: Vec<[f32; W]>,
     gy: Vec<[f32; W]>,
 }
@@ -41,6 +43,7 @@ impl<const W: usize> Objective<W> for SpreadObjective<W> {
             bonus: reward.bonus,
             per_distance: (f64::from(reward.distance) / f64::from(reward.distance_unit)) as f32,
             collision: reward.collision,
+            team: task.reward_target == RewardTarget::Team,
             cover2: radius * radius,
             gx: vec![[0.0; W]; blocks * task.agents],
             gy: vec![[0.0; W]; blocks * task.agents],
@@ -54,8 +57,9 @@ impl<const W: usize> Objective<W> for SpreadObjective<W> {
     fn place_goals(&mut self, swarm: &Swarm<f32, W, Alike<f32>>, goals: &[u32]) {
         for (k, &goal) in goals.iter().enumerate() {
             let world = k / swarm.agents();
-            let [x, y] = swarm.landmark(world, goal as usize);
-            let (place, w) = swarm.place(world, k % swarm.agents());
+            let own = k % swarm.agents();
+            let [x, y] = swarm.landmark(world, if self.team { own } else { goal as usize });
+            let (place, w) = swarm.place(world, own);
             (self.gx[place][w], self.gy[place][w]) = (x, y);
         }
     }
@@ -65,6 +69,9 @@ impl<const W: usize> Objective<W> for SpreadObjective<W> {
         let (x, y, hits) = (&swarm.x[n.clone()], &swarm.y[n.clone()], &swarm.hits[n.clone()]);
         let (gx, gy) = (&self.gx[n.clone()], &self.gy[n]);
         let (bonus, per_distance, collision, cover2) = (self.bonus, self.per_distance, self.collision, self.cover2);
+        if self.team {
+            return self.team_reward([x, y, gx, gy, hits], rewards);
+        }
         let mut sum = [0.0; W];
         for (i, lanes) in rewards.iter_mut().enumerate() {
             for w in 0..W {
@@ -89,6 +96,34 @@ impl<const W: usize> Objective<W> for SpreadObjective<W> {
 }
 
 impl<const W: usize> SpreadObjective<W> {
+    /// Every agent gets the mean over the team: the distance of each landmark to the agent nearest to it, the covered landmarks,
+    /// and the collisions of all.
+    fn team_reward(&self, [x, y, lx, ly, hits]: [&[[f32; W]]; 5], rewards: &mut [[f32; W]]) -> [f32; W] {
+        let mut sum = [0.0; W];
+        for (lx, ly) in lx.iter().zip(ly) {
+            let mut nearest2 = [f32::INFINITY; W];
+            for (x, y) in x.iter().zip(y) {
+                for w in 0..W {
+                    let (dx, dy) = (x[w] - lx[w], y[w] - ly[w]);
+                    nearest2[w] = nearest2[w].min(dx.mul_add(dx, dy * dy));
+                }
+            }
+            for w in 0..W {
+                let bonus = if nearest2[w] <= self.cover2 { self.bonus } else { 0.0 };
+                sum[w] += bonus - self.per_distance * nearest2[w].sqrt();
+            }
+        }
+        for hits in hits {
+            for w in 0..W {
+                sum[w] -= self.collision * hits[w];
+            }
+        }
+        let share = 1.0 / rewards.len() as f32;
+        let each = sum.map(|sum| sum * share);
+        rewards.fill(each);
+        sum
+    }
+
     /// For each landmark of a world, the agents within the covering radius of it.
     pub(super) fn near(&self, swarm: &Swarm<f32, W, Alike<f32>>, world: usize) -> Vec<Vec<u32>> {
         // Agents in groups that fill a register; the last group is filled up with agents out of everything's reach.

@@ -1,10 +1,11 @@
 //! The networks of a run's executor.
 
+use super::mat::Mat;
 use super::{Independent, Network, Policy, build, feature_spec};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
-use magex_core::config::{ExecutorConfig, RunConfig};
+use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
 
 /// A named set of parameters with an optimiser of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,6 +30,9 @@ pub struct Model {
 /// Policy and value function are two networks. Their order is that of their keys: 0 and 1.
 const PARTS: [Part; 2] =
     [Part { name: "actor", policy: true, value: false }, Part { name: "critic", policy: false, value: true }];
+
+/// Policy and value function share the encoder: one network, one optimiser.
+const WHOLE: [Part; 1] = [Part { name: "transformer", policy: true, value: true }];
 
 impl Model {
     /// The executor that a configuration names. `config.task` may have another team size than the weights were trained
@@ -57,26 +61,39 @@ impl Model {
 
     /// The sets of parameters.
     pub fn parts(&self) -> &'static [Part] {
-        &PARTS
+        if self.whole() { &WHOLE } else { &PARTS }
+    }
+
+    fn whole(&self) -> bool {
+        matches!(self.config.kind, ExecutorKind::Mat | ExecutorKind::MatDec)
     }
 
     /// Names, shapes and initial distributions of the parameters of every part.
     pub fn layouts(&self) -> Result<Vec<Vec<Entry>>, ParamError> {
         let mut builders: Vec<ParamBuilder> = self.parts().iter().map(|_| ParamBuilder::layout()).collect();
         self.policy(&mut builders)?;
-        self.value(&mut builders)?;
+        if !self.whole() {
+            self.value(&mut builders)?;
+        }
         Ok(builders.into_iter().map(ParamBuilder::entries).collect())
     }
 
     /// The policy on the given parameters, one builder per part.
     pub fn policy(&self, parts: &mut [ParamBuilder]) -> Result<Box<dyn Policy>, ParamError> {
-        let (heads, outputs) = (self.heads.clone(), self.heads.logits());
-        Ok(Box::new(Independent { network: self.network(&mut parts[0], outputs, 0.01)?, heads }))
+        if self.whole() {
+            return Ok(Box::new(Mat::build(&self.config, &self.spec, &self.heads, &mut parts[0])?));
+        }
+        let (heads, head) = (self.heads.clone(), (self.heads.logits(), 0.01));
+        let network = build(&self.config, &self.spec, head, false, &mut parts[0])?;
+        Ok(Box::new(Independent { network, heads }))
     }
 
     /// The value function on the given parameters, one builder per part: one output per agent, in normalised units.
     pub fn value(&self, parts: &mut [ParamBuilder]) -> Result<Box<dyn Network>, ParamError> {
-        self.network(&mut parts[1], 1, 1.0)
+        if self.whole() {
+            return Ok(Box::new(Mat::build(&self.config, &self.spec, &self.heads, &mut parts[0])?));
+        }
+        build(&self.config, &self.spec, (1, 1.0), true, &mut parts[1])
     }
 
     /// The policy of a weights file.
@@ -89,9 +106,5 @@ impl Model {
         };
         let parts: Result<Vec<ParamBuilder>, ParamError> = self.parts().iter().zip(self.layouts()?).map(load).collect();
         self.policy(&mut parts?)
-    }
-
-    fn network(&self, part: &mut ParamBuilder, outputs: usize, gain: f64) -> Result<Box<dyn Network>, ParamError> {
-        build(&self.config, &self.spec, outputs, gain, part)
     }
 }

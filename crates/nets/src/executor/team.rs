@@ -1,8 +1,9 @@
 //! The paper's executor: Subgraph Extractor, Goal Encoder, State Extractor, Action Generator; and its ablations.
 
+use super::memory::{Memory, Norm};
 use super::{Input, Layer, NeighbourEncoder, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, GraphBlock, constant, graph_block, gru, layer_norm, linear, mean_of_others, softmax};
+use crate::ops::{Activation, GraphBlock, constant, graph_block, linear, mean_of_others, softmax};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -67,26 +68,6 @@ impl Block {
     }
 }
 
-struct Norm {
-    scale: Tensor,
-    shift: Tensor,
-}
-
-impl Norm {
-    fn build(params: &mut ParamBuilder, name: &str, width: usize) -> Result<Self, ParamError> {
-        Ok(Self {
-            scale: params.tensor(&format!("{name}.scale"), &[width], Init::Constant(1.0))?,
-            shift: params.tensor(&format!("{name}.shift"), &[width], Init::Constant(0.0))?,
-        })
-    }
-}
-
-impl Module for Norm {
-    fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
-        layer_norm(x, &self.scale, &self.shift)
-    }
-}
-
 /// Paper, figure 2. F = feature size.
 pub(super) struct TeamNet {
     observe: Layer,
@@ -96,9 +77,7 @@ pub(super) struct TeamNet {
     encounters: Option<NeighbourEncoder>,
     fuse_norm: Option<Norm>,
     state: Layer,
-    gates: Layer,
-    recurrent: (Tensor, Tensor),
-    out_norm: Norm,
+    memory: Memory,
     head: Layer,
     spec: FeatureSpec,
     width: usize,
@@ -148,12 +127,7 @@ impl TeamNet {
             goal: Layer::build(params, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?.on_features(),
             fuse_norm: if config.feature_norm { Some(Norm::build(params, "f_state.norm", fused)?) } else { None },
             state: Layer::build(params, "f_state", (fused, f), relu, RELU_GAIN)?,
-            gates: Layer::build(params, "gru.input", (f, 3 * f), Activation::Identity, 1.0)?,
-            recurrent: (
-                params.tensor("gru.weight", &[f, 3 * f], Init::Orthogonal(1.0))?,
-                params.tensor("gru.bias", &[3 * f], Init::Constant(0.0))?,
-            ),
-            out_norm: Norm::build(params, "gru.norm", f)?,
+            memory: Memory::build(params, f)?,
             head: Layer::build(params, "head", (f, outputs), Activation::Identity, head_gain)?,
             spec: *spec,
             width: f,
@@ -213,7 +187,6 @@ impl TeamNet {
 
 impl Network for TeamNet {
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
-        let sequences = input.sequences * input.agents;
         let team = self.team_features(input)?;
         let goal = self.goal.forward(&constant(input.features.goals.as_slice(), self.spec.goal_width())?)?;
         let mut fused = match &self.encounters {
@@ -223,12 +196,8 @@ impl Network for TeamNet {
         if let Some(norm) = &self.fuse_norm {
             fused = norm.forward(&fused)?;
         }
-        let gates = self.gates.forward(&self.state.forward(&fused)?)?;
-        let gates = gates.reshape((input.steps, sequences, 3 * self.width))?;
-        let (w, b) = &self.recurrent;
-        let states = gru(&gates, w, b, input.hidden.clone())?;
-        let flat = states.reshape((input.steps * sequences, self.width))?;
-        let out = self.head.forward(&self.out_norm.forward(&flat)?)?;
+        let (flat, states) = self.memory.forward(&self.state.forward(&fused)?, input)?;
+        let out = self.head.forward(&flat)?;
         Ok(Output { out, states: Some(states) })
     }
 }
