@@ -80,7 +80,8 @@ pub trait Network: Send + Sync {
 pub fn feature_spec(config: &ExecutorConfig, task: &TaskConfig) -> FeatureSpec {
     if config.kind.flat() {
         let states = config.centralised_critic && matches!(config.kind, ExecutorKind::Flat | ExecutorKind::Dicg);
-        let flat = Some(FlatSpec { observes: config.observes, agent_index: config.agent_index, states });
+        let ExecutorConfig { observes, nearest_first, agent_index, .. } = *config;
+        let flat = Some(FlatSpec { observes, nearest_first, agent_index, states });
         // In the world's axes, as the baselines' authors have it.
         return FeatureSpec { flat, ..FeatureSpec::new(task, false, 0, false) };
     }

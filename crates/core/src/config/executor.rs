@@ -77,6 +77,8 @@ section! {
         neighbours: usize = 6, 1..=64;
         /// What the observation vector of the baselines says about where to go.
         observes: Observes = Observes::Landmarks;
+        /// Whether landmarks, balls and agents stand in the observation vector in the order of their distance, not of their index.
+        nearest_first: bool = false;
         /// Whether the observation vector of the baselines ends with the agent's index, one-hot.
         agent_index: bool = true;
         /// Whether `flat` has a memory (GRU).
@@ -107,8 +109,9 @@ impl ExecutorConfig {
     pub(super) fn check_kind(&self) -> Result<(), FieldError> {
         use ExecutorKind::{Dicg, Flat, Mat, MatDec};
         let (default, kind) = (Self::default(), self.kind);
-        let owners: [(&str, bool, &[ExecutorKind]); 7] = [
+        let owners: [(&str, bool, &[ExecutorKind]); 8] = [
             ("observes", self.observes != default.observes, &[Flat, Mat, MatDec, Dicg]),
+            ("nearest_first", self.nearest_first != default.nearest_first, &[Flat, Mat, MatDec, Dicg]),
             ("agent_index", self.agent_index != default.agent_index, &[Flat, Mat, MatDec, Dicg]),
             ("recurrent", self.recurrent != default.recurrent, &[Flat]),
             ("centralised_critic", self.centralised_critic != default.centralised_critic, &[Flat, Dicg]),

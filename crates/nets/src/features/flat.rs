@@ -1,6 +1,6 @@
 //! The classical flat observation vector of the multi-agent particle environments, and the state of the whole team.
 
-use super::{FeatureSpec, Features, State};
+use super::{FeatureSpec, Features, State, offset};
 use magex_core::config::Observes;
 
 /// What the flat observation vector holds.
@@ -8,6 +8,8 @@ use magex_core::config::Observes;
 pub struct FlatSpec {
     /// All landmarks and balls, or the agent's own goals.
     pub observes: Observes,
+    /// Whether landmarks, balls and agents stand in the order of their distance, not of their index.
+    pub nearest_first: bool,
     /// Whether the vector ends with the agent's index, one-hot.
     pub agent_index: bool,
     /// Whether a critic sees the state of the whole team.
@@ -36,25 +38,31 @@ impl FeatureSpec {
     }
 
     /// Velocity / speed, position, then offsets: to the landmarks and the balls (or to the agent's own goals), to the other
-    /// agents in order of their index. Lengths are in half sides of the map.
+    /// agents; by index or nearest first. Lengths are in half sides of the map.
     pub(super) fn flat_features(&self, flat: FlatSpec, state: &State<'_>, out: &mut Features) {
         let (s, d) = (&self.shape, self.shape.dims);
         let (length, speed) = (1.0 / self.half_side, 1.0 / self.observation.speed);
         for i in 0..s.agents {
-            let (p, v, to) = (state.position(i), state.velocity(i), &mut out.vectors);
-            let toward =
-                |target: &[f32], to: &mut Vec<f32>| to.extend(target.iter().zip(p).map(|(t, p)| (t - p) * length));
-            to.extend(v.iter().map(|v| v * speed));
+            let (p, to) = (state.position(i), &mut out.vectors);
+            to.extend(state.velocity(i).iter().map(|v| v * speed));
             to.extend(p.iter().map(|p| p * length));
             to.extend_from_slice(state.extra(i));
+            let mut put = |mut group: Vec<&[f32]>| {
+                if flat.nearest_first {
+                    // Stable: equals stay in the order of their index.
+                    group.sort_by(|a, b| offset(p, a).1.total_cmp(&offset(p, b).1));
+                }
+                group.into_iter().for_each(|place| to.extend(place.iter().zip(p).map(|(t, p)| (t - p) * length)));
+            };
             match flat.observes {
                 Observes::Landmarks => {
-                    state.landmarks.chunks_exact(d).for_each(|landmark| toward(landmark, to));
-                    (s.agents..s.bodies).for_each(|ball| toward(state.position(ball), to));
+                    put(state.landmarks.chunks_exact(d).collect());
+                    put((s.agents..s.bodies).map(|ball| state.position(ball)).collect());
                 }
-                Observes::Goals => (0..s.goals_per_agent).for_each(|k| toward(state.target(i, k), to)),
+                // Goals have an order of their own: the ball, then its landmark.
+                Observes::Goals => (0..s.goals_per_agent).for_each(|k| put(vec![state.target(i, k)])),
             }
-            (0..s.agents).filter(|&j| j != i).for_each(|j| toward(state.position(j), to));
+            put((0..s.agents).filter(|&j| j != i).map(|j| state.position(j)).collect());
             if flat.agent_index {
                 to.extend((0..s.agents).map(|j| f32::from(u8::from(j == i))));
             }
