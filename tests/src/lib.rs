@@ -18,12 +18,15 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, channel};
 
-/// A run that takes a second: N agents, few and short episodes, every part of the system in use.
+/// A run that takes a second: N agents, few and short episodes, every part of the system in use. Baselines without goals get the
+/// team's reward, `flat` has a memory.
 pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
+    let target = if kind.flat() { "team" } else { "goals" };
+    let recurrent = if kind == ExecutorKind::Flat { "recurrent = true\n" } else { "" };
     let text = format!(
         "[run]\nseed = 5\nmax_steps = {}\ntarget_success = 2.0\neval_every = 2\neval_episodes = 6\nfinal_episodes = 6\n\
          checkpoint_every = 2\n[task]\nname = 'simple-spread'\nagents = {agents}\nhorizon = 20\nspawn = 'uniform'\n\
-         [executor]\nkind = '{kind}'\nhidden = 32\nneighbours = 3\n\
+         reward_target = '{target}'\n[executor]\nkind = '{kind}'\nhidden = 32\nneighbours = 3\n{recurrent}\
          [collect]\nepisodes_per_iteration = 8\nshards_per_iteration = 4\n\
          [mappo]\nepochs = 2\nminibatch_size = 200\nchunk_length = 5\n",
         iterations * 8 * 20
@@ -34,7 +37,8 @@ pub fn small(kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
 /// [`small`] for another task.
 pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations: u64) -> RunConfig {
     let mut config = small(kind, agents, iterations);
-    config.task = TaskConfig { horizon: config.task.horizon, ..TaskConfig::of(name, agents, Spawn::Uniform) };
+    let TaskConfig { horizon, reward_target, .. } = config.task;
+    config.task = TaskConfig { horizon, reward_target, ..TaskConfig::of(name, agents, Spawn::Uniform) };
     config.commander.random_assignment_fraction = 0.5;
     config.validated().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
 }

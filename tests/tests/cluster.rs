@@ -21,7 +21,7 @@ fn wait_for(cluster: &Cluster, iterations: usize) {
 
 #[test]
 fn one_actor_two_actors_and_one_process_learn_the_same_bits() {
-    for kind in [ExecutorKind::Magex, ExecutorKind::Local] {
+    for kind in [ExecutorKind::Magex, ExecutorKind::Local, ExecutorKind::Flat, ExecutorKind::Mat, ExecutorKind::Dicg] {
         let config = small(kind, 6, 4);
         let expected = undisturbed(&config);
         for actors in [1, 2] {

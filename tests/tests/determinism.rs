@@ -22,8 +22,17 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
-const KINDS: [ExecutorKind; 5] =
-    [ExecutorKind::Magex, ExecutorKind::MagexLiteral, ExecutorKind::Attention, ExecutorKind::Mlp, ExecutorKind::Local];
+const KINDS: [ExecutorKind; 9] = [
+    ExecutorKind::Magex,
+    ExecutorKind::MagexLiteral,
+    ExecutorKind::Attention,
+    ExecutorKind::Mlp,
+    ExecutorKind::Local,
+    ExecutorKind::Flat,
+    ExecutorKind::Mat,
+    ExecutorKind::MatDec,
+    ExecutorKind::Dicg,
+];
 
 fn hash(config: &RunConfig, actors: usize, threads: usize) -> String {
     train(config, tempfile::tempdir().unwrap().path(), actors, threads).sha256
@@ -43,7 +52,8 @@ const TASKS: [TaskName; 2] = [TaskName::PushBall, TaskName::Drones];
 
 #[test]
 fn every_task_gives_the_same_bits_and_ratios_of_one() {
-    for (name, kind) in TASKS.into_iter().flat_map(|name| [(name, ExecutorKind::Magex), (name, ExecutorKind::Local)]) {
+    let kinds = [ExecutorKind::Magex, ExecutorKind::Local, ExecutorKind::Flat, ExecutorKind::Mat, ExecutorKind::Dicg];
+    for (name, kind) in TASKS.into_iter().flat_map(|name| kinds.map(|kind| (name, kind))) {
         let config = small_task(name, kind, 4, 3);
         let ran = train(&config, tempfile::tempdir().unwrap().path(), 1, 1);
         assert_eq!(ran.sha256, hash(&config, 3, 2), "{name} {kind}: three rollout and two training threads");
@@ -80,7 +90,7 @@ fn another_seed_learns_something_else() {
 
 #[test]
 fn a_stopped_and_resumed_run_ends_with_the_same_bits() {
-    for kind in [ExecutorKind::Magex, ExecutorKind::Local] {
+    for kind in [ExecutorKind::Magex, ExecutorKind::Local, ExecutorKind::Flat, ExecutorKind::Mat, ExecutorKind::Dicg] {
         let config = small(kind, 5, 5);
         let whole = hash(&config, 2, 1);
         let folder = tempfile::tempdir().unwrap();
@@ -145,6 +155,37 @@ fn the_first_importance_ratio_is_one() {
             assert!(error <= limit, "{kind}: iteration {} has ratio error {error}", line["iteration"]);
             let error = line["commander"]["first_ratio_error"].as_f64().unwrap();
             assert!(error <= 1e-6, "{kind}: the commander's log-probabilities differ by {error}");
+        }
+    }
+}
+
+#[test]
+fn the_first_ratio_of_a_joint_action_is_one_and_it_learns_something_else() {
+    let config = small(ExecutorKind::Dicg, 5, 3);
+    let mut joint = config.clone();
+    joint.mappo.joint_ratio = true;
+    let ran = train(&joint, tempfile::tempdir().unwrap().path(), 2, 1);
+    for line in updates(&ran.events).iter().filter(|l| !l["executor"].is_null()) {
+        assert_eq!(line["executor"]["first_ratio_error"].as_f64(), Some(0.0));
+    }
+    assert_eq!(ran.sha256, hash(&joint, 1, 2));
+    assert_ne!(ran.sha256, hash(&config, 1, 1));
+}
+
+#[test]
+fn a_frozen_graph_keeps_its_initial_convolutions() {
+    let mut config = small(ExecutorKind::Dicg, 5, 2);
+    for frozen in [false, true] {
+        config.executor.frozen_graph = frozen;
+        let folder = tempfile::tempdir().unwrap();
+        let before = Trainer::create(&config, RunId("r".into()), folder.path(), 1).unwrap().learned().clone();
+        let folder = tempfile::tempdir().unwrap();
+        train(&config, folder.path(), 1, 1);
+        let after = checkpoint::read_latest(folder.path(), &before).unwrap().1;
+        let [before, after] = [&before, &after].map(|learned| learned.network("actor").unwrap().params.clone());
+        for entry in &before.entries {
+            let same = before.values[entry.range()] == after.values[entry.range()];
+            assert_eq!(same, frozen && entry.name.starts_with("graph."), "{} frozen: {frozen}", entry.name);
         }
     }
 }

@@ -90,3 +90,35 @@ fn the_effective_configuration_reads_back_for_every_task() {
         assert_eq!(RunConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config, "{name}");
     }
 }
+
+#[test]
+fn a_setting_of_another_executor_is_refused_and_so_is_a_reward_for_goals_that_are_not_seen() {
+    let task = "[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'\n";
+    let error = |text: &str| RunConfig::from_toml(&format!("{task}{text}")).unwrap_err().to_string();
+    for (key, value) in [
+        ("observes", "'goals'"),
+        ("nearest_first", "true"),
+        ("agent_index", "false"),
+        ("recurrent", "true"),
+        ("centralised_critic", "false"),
+        ("attention_blocks", "2"),
+        ("attention_heads", "2"),
+        ("frozen_graph", "true"),
+    ] {
+        let error = error(&format!("[executor]\nkind = 'local'\n{key} = {value}"));
+        assert!(
+            error.contains(&format!("executor.{key}: belongs to ")) && error.contains("is local; remove it"),
+            "{error}"
+        );
+    }
+    let flat = error("[executor]\nkind = 'flat'");
+    assert!(flat.contains("task.reward_target") && flat.contains("or observe goals"), "{flat}");
+    let team = "reward_target = 'team'\n[executor]\nkind = ";
+    assert!(
+        error(&format!("{team}'flat'\nrecurrent = true\nhidden = 40"))
+            .contains("executor.hidden: 40 must be a multiple of 16")
+    );
+    assert!(error(&format!("{team}'mat'\nattention_heads = 3")).contains("executor.attention_heads: 3 must divide"));
+    let sighted = RunConfig::from_toml(&format!("{task}[executor]\nkind = 'flat'\nobserves = 'goals'")).unwrap();
+    assert!(sighted.executor.kind.fixed_team_size());
+}

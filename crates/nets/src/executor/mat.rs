@@ -292,3 +292,6 @@ impl Network for Mat {
         Ok(Output { out: self.value.forward(&self.encoder.forward(input)?)?, states: None })
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,4 +1,5 @@
 use super::*;
+use magex_core::config::{ExecutorConfig, ExecutorKind, Observes};
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{ActionCode, Spawn, TaskName};
@@ -121,4 +122,51 @@ fn a_drone_sees_its_closest_approach_and_no_drone_that_is_out() {
     let expected = [0.0, 0.4, 0.0, 0.25, 0.6];
     assert!(seen.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{seen:?}");
     assert_eq!(features.nodes.len(), 3 * spec.node_width());
+}
+
+fn flat(task: &TaskConfig, nearest_first: bool, observes: Observes) -> FeatureSpec {
+    let config = ExecutorConfig { kind: ExecutorKind::Flat, nearest_first, observes, ..ExecutorConfig::default() };
+    crate::executor::feature_spec(&config, task)
+}
+
+#[test]
+fn the_flat_vector_lists_what_it_says_by_index_or_nearest_first() {
+    // Half side 2: lengths are halved.
+    let task = TaskConfig { side: 4.0, ..TaskConfig::simple_spread(3, Spawn::Uniform) };
+    let positions = [0.0, 0.0, 2.0, 0.0, 0.0, 1.0];
+    let (velocities, landmarks) = ([1.0, -2.0, 0.0, 0.0, 0.0, 0.0], [2.0, 2.0, -1.0, 0.0, 0.0, 0.5]);
+    let see = |nearest_first, observes| {
+        let spec = flat(&task, nearest_first, observes);
+        let features = see(&spec, &positions, &velocities, &landmarks, &[2, 0, 1]);
+        assert_eq!(features.vectors.len(), 3 * spec.vector_width());
+        assert_eq!((features.states.len(), features.goals.len()), (spec.state_width(), 0));
+        features
+    };
+    let own = [0.5, -1.0, 0.0, 0.0];
+    let (others, index) = ([1.0, 0.0, 0.0, 0.5], [1.0, 0.0, 0.0]);
+    let by_index = see(false, Observes::Landmarks);
+    let expected = [&own[..], &[1.0, 1.0, -0.5, 0.0, 0.0, 0.25], &others, &index].concat();
+    assert_eq!(by_index.vectors[..17], expected);
+    let nearest = see(true, Observes::Landmarks);
+    let expected = [&own[..], &[0.0, 0.25, -0.5, 0.0, 1.0, 1.0], &[0.0, 0.5, 1.0, 0.0], &index].concat();
+    assert_eq!(nearest.vectors[..17], expected);
+    assert_eq!(nearest.states, by_index.states);
+    let goal = see(false, Observes::Goals);
+    assert_eq!(goal.vectors[..13], [&own[..], &[0.0, 0.25], &others, &index].concat());
+    let state = [&[0.0, 0.0, 1.0, 0.0, 0.0, 0.5, 0.5, -1.0][..], &[0.0; 4], &[1.0, 1.0, -0.5, 0.0, 0.0, 0.25]].concat();
+    assert_eq!(goal.states, state);
+}
+
+#[test]
+fn chunks_of_flat_features_keep_their_states() {
+    let task = TaskConfig::of(TaskName::PushBall, 2, Spawn::Uniform);
+    let spec = flat(&task, true, Observes::Landmarks);
+    let mut stream = Key::new(1, Purpose::Bench, &[8]).stream();
+    let (positions, velocities) = (numbers(&mut stream, 3 * 8), numbers(&mut stream, 3 * 8));
+    let landmarks = numbers(&mut stream, 4);
+    let all = see(&spec, &positions, &velocities, &landmarks, &[0, 1, 1, 0]);
+    let last = see(&spec, &positions[16..], &velocities[16..], &landmarks, &[0, 1, 1, 0]);
+    let mut chunk = Features::default();
+    chunk.append(&all, (4, 2), 6, 2);
+    assert_eq!((chunk.vectors, chunk.states), (last.vectors, last.states));
 }
