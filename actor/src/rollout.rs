@@ -11,10 +11,11 @@ use magex_core::error::FieldError;
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::keys::episode_keys;
 use magex_core::metrics_table::{COST_RATIO, SECOND_COST_RATIO};
+use magex_core::rng::Key;
 use magex_core::statics::Statics;
-use magex_core::task::ActionCode;
+use magex_core::task::{ActionCode, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
-use magex_env::{Controller, Env, new_env, scripted};
+use magex_env::{Controller, Env, new_env};
 use magex_nets::executor::{Model, Policy};
 use magex_nets::features::Symmetry;
 use magex_nets::params::ParamError;
@@ -47,15 +48,23 @@ pub enum RolloutError<E> {
 /// What drives the agents of a shard.
 enum Driver<'a> {
     Policy(&'a dyn Policy, Carried),
-    Scripted(Box<dyn Controller>),
+    Controller(Box<dyn Controller>),
+}
+
+/// Makes the controller of a shard, given the task and one key per episode.
+pub type MakeController = Box<dyn Fn(&TaskConfig, &[Key]) -> Result<Box<dyn Controller>, FieldError> + Send + Sync>;
+
+/// Where the drivers of shards come from.
+enum Source {
+    Policy(Box<dyn Policy>),
+    Controller(MakeController),
 }
 
 /// Everything that is the same for all shards of a version of the weights.
 pub struct Roller {
     config: RunConfig,
     model: Model,
-    /// `None`: the task's scripted controller drives the agents.
-    policy: Option<Box<dyn Policy>>,
+    source: Source,
 }
 
 impl std::fmt::Debug for Roller {
@@ -69,13 +78,13 @@ impl Roller {
     /// with, if the architecture allows it.
     pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         let model = Model::new(config)?;
-        let policy = Some(model.load_policy(weights)?);
-        Ok(Self { config: config.clone(), model, policy })
+        let source = Source::Policy(model.load_policy(weights)?);
+        Ok(Self { config: config.clone(), model, source })
     }
 
-    /// With the task's scripted controller instead of a policy (evaluation only).
-    pub fn scripted(config: &RunConfig) -> Result<Self, ParamError> {
-        Ok(Self { config: config.clone(), model: Model::new(config)?, policy: None })
+    /// With a controller instead of a policy (evaluation only).
+    pub fn with_controller(config: &RunConfig, make: MakeController) -> Result<Self, ParamError> {
+        Ok(Self { config: config.clone(), model: Model::new(config)?, source: Source::Controller(make) })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -98,15 +107,16 @@ impl Roller {
         let reply = assign(&request).map_err(RolloutError::Goals)?;
         state.goals = chain(&shape, &reply.goals);
         worlds.set_goals(&state.goals)?;
-        let mut driver = match &self.policy {
-            Some(policy) => {
+        let mut driver = match &self.source {
+            Source::Policy(policy) => {
                 let graph = keys.iter().map(|k| k.graph);
                 Driver::Policy(policy.as_ref(), Carried::new(&self.model, shard, n, graph))
             }
-            None => {
-                let mut controller = scripted(task);
+            Source::Controller(make) => {
+                let keys: Vec<Key> = keys.iter().map(|k| k.controller).collect();
+                let mut controller = make(task, &keys)?;
                 controller.begin(&state.joint_state())?;
-                Driver::Scripted(controller)
+                Driver::Controller(controller)
             }
         };
 
@@ -137,7 +147,7 @@ impl Roller {
                     }
                     symmetries = features.symmetries;
                 }
-                Driver::Scripted(controller) => controller.act(&state.joint_state(), &mut chosen.actions)?,
+                Driver::Controller(controller) => controller.act(&state.joint_state(), &mut chosen.actions)?,
             }
             if keep {
                 out.actions.extend_from_slice(&chosen.actions);

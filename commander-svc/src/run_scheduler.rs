@@ -47,6 +47,7 @@ impl Scheduler for RunScheduler {
     fn method(&self) -> AssignmentMethod {
         match self.commander.kind() {
             CommanderPolicy::Exact => AssignmentMethod::Exact,
+            CommanderPolicy::Greedy => AssignmentMethod::Greedy,
             CommanderPolicy::Random => AssignmentMethod::Random,
             CommanderPolicy::Pairwise | CommanderPolicy::Ranking => AssignmentMethod::Learned,
         }

@@ -94,6 +94,8 @@ pub enum CommanderPolicy {
     Ranking,
     /// Exact assignment (the paper's "Hungarian").
     Exact,
+    /// The cheapest remaining pair of agent and goal, repeatedly.
+    Greedy,
     /// Random assignment (the paper's ablation "w. RG").
     Random,
 }
@@ -119,7 +121,7 @@ impl std::fmt::Display for CommanderPolicy {
 impl std::str::FromStr for CommanderPolicy {
     type Err = UnknownName;
     fn from_str(text: &str) -> Result<Self, UnknownName> {
-        let choices = "pairwise, ranking, exact or random";
+        let choices = "pairwise, ranking, exact, greedy or random";
         Self::deserialize(text.into_deserializer()).map_err(|_: serde::de::value::Error| UnknownName {
             what: "scheduler",
             name: text.to_owned(),

@@ -15,6 +15,8 @@ pub struct EpisodeKeys {
     pub graph: Key,
     /// Goal sampling.
     pub commander: Key,
+    /// Randomness of a controller without weights.
+    pub controller: Key,
 }
 
 /// Keys of the b-th episode of a shard. Evaluation episodes are named by their set and index alone, so that a set does
@@ -27,7 +29,9 @@ pub fn episode_keys(seed: u64, shard: &Shard, b: u32) -> EpisodeKeys {
     };
     let [spawn, action, graph, commander] =
         purposes.map(|purpose| Key::new(seed, purpose, &[set, shard.first_episode + b]));
-    EpisodeKeys { spawn, action, graph, commander }
+    let kind = u32::from(shard.kind == ShardKind::Eval);
+    let controller = Key::new(seed, Purpose::Controller, &[set, shard.first_episode + b, kind]);
+    EpisodeKeys { spawn, action, graph, commander, controller }
 }
 
 /// Whether the b-th episode of a shard gets a random matching instead of the scheduler's, which happens to a given share

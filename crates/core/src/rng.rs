@@ -40,6 +40,8 @@ pub enum Purpose {
     EvalGraph = 13,
     /// Whether a training episode's goals are a random matching, and which; indices: iteration, episode.
     RandomGoals = 14,
+    /// Randomness of a controller without weights (noise, random actions); indices: set or iteration, episode, 1 in evaluation.
+    Controller = 15,
 }
 
 /// The name of a stream.

@@ -23,10 +23,10 @@ mod push_ball;
 mod rules;
 mod tasks;
 
-pub use controller::Controller;
+pub use controller::{Classical, Controller};
 pub use env::Env;
 pub use particles::constants::CONTACT_DISTANCE;
 pub use particles::real::Real;
 pub use rules::{Rules, Score};
 pub use spread::start as spawn;
-pub use tasks::{env_from_state, new_env, scripted};
+pub use tasks::{classical, env_from_state, new_env, scripted};

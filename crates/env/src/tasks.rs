@@ -1,11 +1,13 @@
 //! The list of tasks.
 
-use crate::controller::{Controller, DroneScript, PushBallScript, SpreadScript};
+use crate::controller::{
+    Astar, Classical, Controller, DroneScript, Nearest, Orca, PushBallScript, Random, SpreadScript,
+};
 use crate::env::Env;
 use crate::rules::{Rules, Starts};
 use crate::{drones, push_ball, spread};
 use magex_core::error::FieldError;
-use magex_core::rng::Stream;
+use magex_core::rng::{Key, Stream};
 use magex_core::task::{TaskConfig, TaskName};
 
 /// Episodes of a task, one per stream, started as the task says. In training, starts that help learning may be mixed in. An
@@ -60,4 +62,16 @@ pub fn scripted(task: &TaskConfig) -> Box<dyn Controller> {
         TaskName::PushBall => Box::new(PushBallScript::new(task.agents)),
         TaskName::Drones => Box::new(DroneScript::new(task.agents)),
     }
+}
+
+/// A controller without weights for B episodes of a task; `keys` (B of them) name what is random about it.
+pub fn classical(kind: Classical, task: &TaskConfig, keys: &[Key]) -> Result<Box<dyn Controller>, FieldError> {
+    kind.check(task)?;
+    Ok(match kind {
+        Classical::Scripted => scripted(task),
+        Classical::Astar => Box::new(Astar::new(task)),
+        Classical::Orca => Box::new(Orca::new(task, keys)),
+        Classical::Nearest => Box::new(Nearest::new(task, scripted(task))),
+        Classical::Random => Box::new(Random::new(task, keys)),
+    })
 }

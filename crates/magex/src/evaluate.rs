@@ -4,12 +4,14 @@ use crate::failure::usage;
 use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
 use crate::logging::set_live_line;
+use crate::planning_clock::PlanningClock;
 use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
+use magex_env::Classical;
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
 use magex_runtime::options;
 use magex_runtime::sync::lock;
@@ -29,8 +31,44 @@ pub(crate) enum Controller {
     /// The trained executor.
     #[default]
     Learned,
-    /// The scripted controller: steers towards the goal without learning; a baseline.
+    /// Steers to the goal, brakes in time, ignores the others.
     Scripted,
+    /// Multi-agent A*: plans paths around each other and follows them.
+    Astar,
+    /// Optimal reciprocal collision avoidance.
+    Orca,
+    /// Scripted, to the nearest landmark, whatever the others do.
+    Nearest,
+    /// Random actions.
+    Random,
+}
+
+impl Controller {
+    /// The controller without weights.
+    fn classical(self) -> Option<Classical> {
+        match self {
+            Self::Learned => None,
+            Self::Scripted => Some(Classical::Scripted),
+            Self::Astar => Some(Classical::Astar),
+            Self::Orca => Some(Classical::Orca),
+            Self::Nearest => Some(Classical::Nearest),
+            Self::Random => Some(Classical::Random),
+        }
+    }
+
+    /// Which modes are worth evaluating unless others are asked for: controllers without weights have one only.
+    pub(crate) fn modes(self) -> Modes {
+        if self == Self::Learned { Modes::Both } else { Modes::Greedy }
+    }
+}
+
+impl std::fmt::Display for Controller {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.classical() {
+            None => f.write_str("learned"),
+            Some(classical) => classical.fmt(f),
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -63,7 +101,7 @@ pub(crate) fn mode_name(mode: Mode) -> &'static str {
 /// A run, and the starts on which it is evaluated.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Subject {
-    /// Run folder, or a weights file together with --config.
+    /// Run folder, a weights file together with --config, or, where nothing learned is asked for, a configuration file.
     #[arg(value_name = "RUN")]
     pub(crate) run: PathBuf,
     /// Configuration of a weights file.
@@ -82,7 +120,12 @@ pub(crate) struct Subject {
 impl Subject {
     /// Loads the run, with its configuration as it is evaluated.
     pub(crate) fn load(&self) -> anyhow::Result<(Trained, RunConfig)> {
-        let trained = folder::load(&self.run, self.config.as_deref())?;
+        let trained = match &self.config {
+            None if self.run.is_file() && self.run.extension().is_some_and(|ending| ending == "toml") => {
+                self.untrained()?
+            }
+            config => folder::load(&self.run, config.as_deref())?,
+        };
         if self.strict && !trained.is_final {
             let notes = trained.notes.join("; ");
             return Err(anyhow::anyhow!("--strict: these are not the weights of a finished run: {notes}"));
@@ -90,6 +133,29 @@ impl Subject {
         trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
         let config = self.vary.apply(&trained)?;
         Ok((trained, config))
+    }
+
+    /// A configuration file in place of a run, for what has no weights.
+    fn untrained(&self) -> anyhow::Result<Trained> {
+        let file = self.run.display();
+        if self.vary.controller == Controller::Learned {
+            return Err(usage(format!(
+                "RUN: {file} is a configuration, not weights, which --controller learned needs; \
+                 name a run folder, or add --controller scripted, astar, orca, nearest or random"
+            )));
+        }
+        let trained = folder::untrained(&self.run)?;
+        let scheduler = self.vary.scheduler_of(&trained.config);
+        if scheduler.learned() {
+            return Err(usage(format!(
+                "RUN: {file} is a configuration, not weights, which the {scheduler} scheduler needs; \
+                 name a run folder, or add --scheduler exact, greedy or random"
+            )));
+        }
+        if self.strict {
+            return Err(usage(format!("--strict: {file} is a configuration and has no weights; leave --strict out")));
+        }
+        Ok(trained)
     }
 }
 
@@ -103,7 +169,7 @@ pub(crate) struct Variation {
     /// Team size; the map scales with it. Not for the mlp executor and the ranking scheduler, which have a fixed size.
     #[arg(long, value_name = "N", value_parser = options::whole::<usize>(1, AGENTS_MAX as u64))]
     pub(crate) agents: Option<usize>,
-    /// Goal scheduler: pairwise, ranking, exact or random.
+    /// Goal scheduler: pairwise, ranking, exact, greedy or random.
     #[arg(long, value_name = "KIND")]
     pub(crate) scheduler: Option<CommanderPolicy>,
     /// What chooses the actions.
@@ -134,23 +200,35 @@ impl Variation {
         if let Some(kind) = self.scheduler.filter(|kind| kind.learned() && *kind != config.commander.kind) {
             let own = config.commander.kind;
             return Err(usage(format!(
-                "--scheduler {kind}: the run trained the {own} scheduler; use {own}, exact or random"
+                "--scheduler {kind}: the run trained the {own} scheduler; use {own}, exact, greedy or random"
             )));
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
         // Evaluation does not train: the chunk length need not divide the horizon.
         config.mappo.chunk_length = 1;
-        Ok(config.validated()?)
+        let config = config.validated()?;
+        if let Some(classical) = self.controller.classical() {
+            classical.check(&config.task).map_err(|error| usage(format!("--{error}")))?;
+        }
+        Ok(config)
     }
 
-    pub(crate) fn policy(&self, config: &RunConfig, weights: &[u8]) -> anyhow::Result<LoadedPolicy> {
-        let roller = match self.controller {
-            Controller::Learned => Roller::new(config, weights)?,
-            Controller::Scripted => Roller::scripted(config)?,
+    /// What rolls the episodes out, and what a controller without weights took for it.
+    pub(crate) fn policy(
+        &self,
+        config: &RunConfig,
+        weights: &[u8],
+    ) -> anyhow::Result<(LoadedPolicy, Option<PlanningClock>)> {
+        let (roller, planning) = match self.controller.classical() {
+            None => (Roller::new(config, weights)?, None),
+            Some(classical) => {
+                let clock = PlanningClock::default();
+                (Roller::with_controller(config, clock.timed(classical))?, Some(clock))
+            }
         };
         let commander = commander(config, weights, self.scheduler)?;
-        Ok(LoadedPolicy { roller, commander, random_assignment_fraction: 0.0 })
+        Ok((LoadedPolicy { roller, commander, random_assignment_fraction: 0.0 }, planning))
     }
 
     pub(crate) fn scheduler_of(&self, config: &RunConfig) -> CommanderPolicy {
@@ -307,6 +385,6 @@ mod tests {
         let exact = Variation { scheduler: Some(CommanderPolicy::Exact), ..vary.clone() };
         exact.apply(&trained("[commander]\nkind = 'ranking'")).unwrap();
         let ranking = Variation { scheduler: Some(CommanderPolicy::Ranking), ..Variation::default() };
-        assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact or random"));
+        assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact, greedy or random"));
     }
 }

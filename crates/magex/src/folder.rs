@@ -101,9 +101,9 @@ pub fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
 pub struct Trained {
     /// The configuration of the run.
     pub config: RunConfig,
-    /// Weights file.
+    /// Weights file; empty without weights.
     pub weights: Vec<u8>,
-    /// SHA-256 of the weights file.
+    /// SHA-256 of the weights file; empty without weights.
     pub sha256: String,
     /// Display name.
     pub name: String,
@@ -136,6 +136,20 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
     let (weights, notes, is_final) = weights_of(path, &config)?;
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
     Ok(Trained { config, sha256: sha256::hex(&weights), weights, name, folder: Some(path.to_owned()), notes, is_final })
+}
+
+/// A configuration file as a run without weights.
+pub(crate) fn untrained(path: &Path) -> anyhow::Result<Trained> {
+    let (config, name) = (crate::settings::read_from("RUN", path)?, path.display().to_string());
+    Ok(Trained {
+        config,
+        weights: Vec::new(),
+        sha256: String::new(),
+        name,
+        folder: None,
+        notes: Vec::new(),
+        is_final: false,
+    })
 }
 
 /// The final weights if they exist and are intact, otherwise those of the newest usable checkpoint.

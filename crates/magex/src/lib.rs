@@ -24,5 +24,6 @@ mod evaluate;
 mod logging;
 mod parallel;
 mod parent_watch;
+mod planning_clock;
 mod progress;
 mod synthetic;

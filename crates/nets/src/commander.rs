@@ -5,6 +5,7 @@
 //! | `pairwise` | a score for every (agent, goal) pair; the agent of the largest regret picks next among the goals still free. Equivariant, any N |
 //! | `ranking` | the paper's Goal Scheduler: one score per goal, ranked, handed to the agents in canonical order |
 //! | `exact` | the least summed distance (Jonker–Volgenant; the paper's "Hungarian") |
+//! | `greedy` | the shortest remaining way of an agent to a goal, repeatedly |
 //! | `random` | a random permutation (the paper's ablation "w. RG") |
 
 mod instance;
@@ -15,7 +16,7 @@ use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
 use candle_core::Tensor;
 use magex_assign::random::random;
-use magex_assign::{AssignError, exact_points};
+use magex_assign::{AssignError, distance, exact_points, greedy};
 use magex_core::config::{CommanderConfig, CommanderPolicy};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
@@ -110,7 +111,7 @@ impl Commander {
             CommanderPolicy::Ranking => {
                 Some(Net::Ranking(RankingNet::build(config.hidden, agents, dims, config.order, params)?))
             }
-            CommanderPolicy::Exact | CommanderPolicy::Random => None,
+            CommanderPolicy::Exact | CommanderPolicy::Greedy | CommanderPolicy::Random => None,
         };
         Ok(Self { kind: config.kind, net })
     }
@@ -161,6 +162,7 @@ impl Commander {
                 Ok(instance.decide(&scores, stream).0)
             }
             (None, CommanderPolicy::Random) => Ok(classical(random(n, team.goal_count(), stream)?)),
+            (None, CommanderPolicy::Greedy) => Ok(classical(greedy_goals(team)?)),
             (None, _) => Ok(classical(exact_points(team.agents, team.goals, team.dims)?.0)),
         }
     }
@@ -193,4 +195,11 @@ impl Commander {
         });
         Ok(pick_log_probs(&self.scores(instances)?, Arc::new(tables.collect()))?)
     }
+}
+
+/// The goals that greedy assignment by distance gives.
+fn greedy_goals(team: &Team<'_>) -> Result<Vec<u32>, AssignError> {
+    let (agents, goals) = (team.agents.chunks_exact(team.dims), team.goals.chunks_exact(team.dims));
+    let cost: Vec<f64> = agents.flat_map(|agent| goals.clone().map(|goal| distance(agent, goal))).collect();
+    Ok(greedy(&cost, team.agent_count(), team.goal_count(), &|| true)?.col_of_row)
 }

@@ -31,14 +31,25 @@ impl Controller for DroneScript {
         for (k, actions) in actions.chunks_exact_mut(3).enumerate() {
             let of_episode = k % goals.len();
             let landmark = 3 * (of_episode / agents * agents + goals[of_episode] as usize);
-            for (d, action) in actions.iter_mut().enumerate() {
-                let way = f64::from(landmarks[landmark + d]) - f64::from(state.positions[3 * k + d]);
-                let wanted = (APPROACH * way).clamp(-MOST_SPEED, MOST_SPEED);
-                let missing = wanted - f64::from(state.agent_state[DroneConfig::AGENT_STATE * k + d]);
-                *action = nearest(missing);
-            }
+            steer(state, k, [0, 1, 2].map(|d| landmarks[landmark + d]), actions);
         }
         Ok(())
+    }
+}
+
+/// Steers the k-th drone of all states to a target.
+pub(super) fn steer(state: &JointState<'_>, k: usize, target: [f32; 3], actions: &mut [u8]) {
+    command(state, k, actions, |d| {
+        let way = f64::from(target[d]) - f64::from(state.positions[3 * k + d]);
+        (APPROACH * way).clamp(-MOST_SPEED, MOST_SPEED)
+    });
+}
+
+/// Brings the target velocity of the k-th drone of all states nearest to what is wanted along each axis, m/s.
+pub(super) fn command(state: &JointState<'_>, k: usize, actions: &mut [u8], wanted: impl Fn(usize) -> f64) {
+    for (d, action) in actions.iter_mut().enumerate() {
+        let target_velocity = f64::from(state.agent_state[DroneConfig::AGENT_STATE * k + d]);
+        *action = nearest(wanted(d) - target_velocity);
     }
 }
 

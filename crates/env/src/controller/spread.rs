@@ -25,24 +25,35 @@ impl SpreadScript {
 impl Controller for SpreadScript {
     fn act(&mut self, state: &JointState<'_>, actions: &mut [u8]) -> Result<(), FieldError> {
         check(&self.task, state, actions)?;
-        let (agents, positions, velocities) = (self.task.agents, state.positions, state.velocities);
-        let landmarks = state.landmarks();
-        let physics = Physics::<f32>::standard();
-        let stop = physics.dt / (1.0 - physics.keep);
-        // Where the agent stops without thrust is off by e; an action moves that point by `push` along one axis.
-        let (glide, push) = (stop * physics.keep, stop * physics.dt * physics.sensitivity);
+        let (agents, landmarks) = (self.task.agents, state.landmarks());
         for (k, action) in actions.iter_mut().enumerate() {
             let of_episode = k % state.goals.len();
             let goal = of_episode / agents * agents + state.goals[of_episode] as usize;
-            let e = [0, 1].map(|d| positions[2 * k + d] + glide * velocities[2 * k + d] - landmarks[2 * goal + d]);
-            *action = nearest_stop(e, push);
+            *action = steer(state, k, [landmarks[2 * goal], landmarks[2 * goal + 1]]);
         }
         Ok(())
     }
 }
 
+/// The action after which the k-th agent of all states would come to rest nearest to a target.
+pub(super) fn steer(state: &JointState<'_>, k: usize, target: [f32; 2]) -> u8 {
+    let physics = Physics::<f32>::standard();
+    let stop = physics.dt / (1.0 - physics.keep);
+    // Where the agent stops without thrust is off by e; an action moves that point by `push` along one axis.
+    let (glide, push) = (stop * physics.keep, stop * physics.dt * physics.sensitivity);
+    let e = [0, 1].map(|d| state.positions[2 * k + d] + glide * state.velocities[2 * k + d] - target[d]);
+    least_error(e, push)
+}
+
+/// The action after which the k-th agent of all states has the velocity nearest to a wanted one.
+pub(super) fn accelerate(state: &JointState<'_>, k: usize, wanted: [f32; 2]) -> u8 {
+    let physics = Physics::<f32>::standard();
+    let e = [0, 1].map(|d| physics.keep * state.velocities[2 * k + d] - wanted[d]);
+    least_error(e, physics.dt * physics.sensitivity)
+}
+
 /// argmin over the actions of |e + push · direction|: thrust against the larger error, if it is worth half a push.
-fn nearest_stop(e: [f32; 2], push: f32) -> u8 {
+fn least_error(e: [f32; 2], push: f32) -> u8 {
     let [along_x, along_y] = e.map(f32::abs);
     if along_x.max(along_y) <= 0.5 * push {
         0
@@ -68,7 +79,7 @@ mod tests {
                 let e = [0.0137 * a as f32, 0.0131 * b as f32];
                 let distance = |u: [f32; 2]| (e[0] + 0.2 * u[0]).powi(2) + (e[1] + 0.2 * u[1]).powi(2);
                 let best = directions.map(distance).into_iter().fold(f32::INFINITY, f32::min);
-                let chosen = directions[usize::from(nearest_stop(e, 0.2))];
+                let chosen = directions[usize::from(least_error(e, 0.2))];
                 assert!(distance(chosen) <= best + 1e-6, "{e:?}");
             }
         }

@@ -79,6 +79,9 @@ struct Row {
     spawn: Spawn,
     #[serde(flatten)]
     summary: EvalSummary,
+    /// Mean time that a controller without weights computed per episode; absent for the learned one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    planning_ms: Option<f64>,
     wall_s: f64,
 }
 
@@ -88,23 +91,21 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
     let scheduler = vary.scheduler_of(&config);
-    let modes = args.mode.unwrap_or(match vary.controller {
-        Controller::Learned => Modes::Both,
-        Controller::Scripted => Modes::Greedy,
-    });
+    let modes = args.mode.unwrap_or(vary.controller.modes());
     let seeds = if args.episode_seeds.is_empty() { vec![config.run.seed] } else { args.episode_seeds.clone() };
     let spawns = layouts(config.task.spawn, args.per_layout)?;
     let threads = args.threads.unwrap_or_else(processors);
     let driver = match vary.controller {
         Controller::Learned => format!("executor {}", config.executor.kind),
-        Controller::Scripted => "scripted controller".to_owned(),
+        controller => format!("{controller} controller"),
+    };
+    let weights = match trained.sha256.get(..12) {
+        Some(hash) => format!("weights {hash}"),
+        None => "no weights".to_owned(),
     };
     note(format!(
-        "{} · weights {} · N = {} · {driver} · scheduler {scheduler} · {} episodes per row",
-        trained.name,
-        &trained.sha256[..12.min(trained.sha256.len())],
-        config.task.agents,
-        args.episodes
+        "{} · {weights} · N = {} · {driver} · scheduler {scheduler} · {} episodes per row",
+        trained.name, config.task.agents, args.episodes
     ));
 
     let mut rows: Vec<Row> = Vec::new();
@@ -113,7 +114,7 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         for &seed in &seeds {
             let mut config = config.clone();
             (config.run.seed, config.task.spawn) = (seed, spawn);
-            let policy = vary.policy(&config, &trained.weights)?;
+            let (policy, planning) = vary.policy(&config, &trained.weights)?;
             for &mode in modes.list() {
                 let clock = Instant::now();
                 let record = u32::from(args.record.is_some() && rows.is_empty());
@@ -125,8 +126,10 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
                     artifacts::write_replay(path, &trained.name, &subtitle, &config, &episode)?;
                     note(format!("replay: {}", path.display()));
                 }
+                let planning_ms = planning.as_ref().map(|clock| clock.take_ms() / f64::from(args.episodes));
                 if let Some(summary) = summarise(&metrics) {
-                    rows.push(Row { seed, mode, spawn, summary, wall_s: clock.elapsed().as_secs_f64() });
+                    let wall_s = clock.elapsed().as_secs_f64();
+                    rows.push(Row { seed, mode, spawn, summary, planning_ms, wall_s });
                 }
                 all.push((mode, metrics));
             }
@@ -135,24 +138,35 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
 
     let mut means = Map::new();
     let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.label);
-    let heading: Vec<&str> = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns).collect();
+    let timed = vary.controller != Controller::Learned;
+    let heading = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns);
+    let heading: Vec<&str> = heading.chain(timed.then_some("planning ms")).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
-        table.row(cells(&config.task, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary));
+        let mut cells = cells(&config.task, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary);
+        cells.extend(row.planning_ms.map(|ms| format!("{ms:.2}")));
+        table.row(cells);
     }
     for &mode in modes.list() {
         let of_mode = all.iter().filter(|(m, _)| *m == mode).flat_map(|(_, metrics)| metrics);
         let Some(summary) = summarise(of_mode) else { continue };
+        let planning_ms = planning_ms(&rows, mode);
         if rows.len() > modes.list().len() {
-            table.row(cells(&config.task, ["all".into(), String::new()], mode, &summary));
+            let mut cells = cells(&config.task, ["all".into(), String::new()], mode, &summary);
+            cells.extend(planning_ms.map(|ms| format!("{ms:.2}")));
+            table.row(cells);
         }
-        means.insert(mode_name(mode).into(), serde_json::to_value(summary)?);
+        let mut mean = serde_json::to_value(summary)?;
+        if let (Some(ms), Some(mean)) = (planning_ms, mean.as_object_mut()) {
+            mean.insert("planning_ms".into(), json!(ms));
+        }
+        means.insert(mode_name(mode).into(), mean);
     }
     output.say(table.to_string());
     note(format!("{} with {threads} threads", seconds(rows.iter().map(|row| row.wall_s).sum())));
     output.result(&json!({
         "run": args.subject.run,
-        "weights_sha256": trained.sha256,
+        "weights_sha256": (!trained.weights.is_empty()).then_some(&trained.sha256),
         "weights_final": trained.is_final,
         "warnings": trained.notes,
         "task": config.task.name,
@@ -160,12 +174,18 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         "horizon": config.task.horizon,
         "executor": config.executor.kind,
         "scheduler": scheduler,
-        "controller": format!("{:?}", vary.controller).to_lowercase(),
+        "controller": vary.controller.to_string(),
         "eval_set": args.subject.eval_set,
         "rows": rows,
         "mean": means,
     }));
     Ok(exit::OK)
+}
+
+/// Mean over the rows of a mode, which have equally many episodes.
+fn planning_ms(rows: &[Row], mode: Mode) -> Option<f64> {
+    let of_mode: Vec<f64> = rows.iter().filter(|row| row.mode == mode).filter_map(|row| row.planning_ms).collect();
+    (!of_mode.is_empty()).then(|| of_mode.iter().sum::<f64>() / of_mode.len() as f64)
 }
 
 fn layouts(spawn: Spawn, each: bool) -> anyhow::Result<Vec<Spawn>> {

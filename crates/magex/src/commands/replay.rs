@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<
     args.out.as_deref().map_or(Ok(()), artifacts::check)?;
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
-    let policy = vary.policy(&config, &trained.weights)?;
+    let (policy, _) = vary.policy(&config, &trained.weights)?;
     note(format!("{} · N = {} · recording {} episodes", trained.name, config.task.agents, args.episodes));
     let mut episodes = Vec::new();
     for &mode in args.mode.list() {
@@ -55,7 +55,7 @@ pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<
     let modes: Vec<&str> = args.mode.list().iter().copied().map(mode_name).collect();
     let driver = match vary.controller {
         Controller::Learned => String::new(),
-        Controller::Scripted => " · scripted controller".to_owned(),
+        controller => format!(" · {controller} controller"),
     };
     let scheduler = vary.scheduler.map(|kind| format!(" · goals from {kind}")).unwrap_or_default();
     let subtitle = format!("{} · {}{driver}{scheduler}", describe(&config), modes.join(" and "));
