@@ -21,9 +21,7 @@ const ROUNDS: usize = 16;
 /// Pace and look-ahead of the tracking, joint steps.
 struct Pace {
     /// κ: steps per cell.
-    usual: u32,
-    /// κ where a way would not fit into the episode otherwise.
-    hurried: u32,
+    per_cell: u32,
     /// The agent steers to where its path is this many steps later, because it needs as long to follow.
     ahead: u32,
 }
@@ -31,17 +29,11 @@ struct Pace {
 impl Pace {
     fn of(task: &TaskConfig) -> Self {
         match task.action_code() {
-            // 1 and 2 units/s; the velocity lags by 3 steps: 0.1 / (1 - 0.75) - 0.1 = 0.3 s.
-            ActionCode::Thrust => Self { usual: 2, hurried: 1, ahead: 3 },
-            // 1 and 1.5 m/s; 1 / APPROACH + 0.28 s = 23 commands.
-            ActionCode::PerAxis => Self { usual: 6, hurried: 4, ahead: 23 },
+            // 2 units/s, full speed; the velocity lags by 0.1 / (1 - 0.75) - 0.1 = 0.3 s.
+            ActionCode::Thrust => Self { per_cell: 1, ahead: 3 },
+            // 1.5 m/s of at most 2; 1 / APPROACH + 0.28 s = 23 commands.
+            ActionCode::PerAxis => Self { per_cell: 4, ahead: 23 },
         }
-    }
-
-    /// κ of an episode whose longest way has so many cells, if a quarter more time is left for others on the way.
-    fn steps_per_cell(&self, longest: u32, horizon: u32) -> u32 {
-        let needed = (longest + longest / 4).saturating_mul(self.usual).saturating_add(2 * self.ahead);
-        if needed <= horizon { self.usual } else { self.hurried }
     }
 }
 
@@ -51,7 +43,7 @@ struct Course {
     grid: Grid,
     plan: Plan,
     /// κ.
-    pace: u32,
+    per_cell: u32,
 }
 
 impl Course {
@@ -59,19 +51,19 @@ impl Course {
         let grid = Grid::around(&[starts, goals].concat())?;
         let trips: Vec<(u32, u32)> = grid.distinct_cells(starts).into_iter().zip(grid.distinct_cells(goals)).collect();
         let longest = trips.iter().map(|&(start, goal)| grid.manhattan(start, goal)).max().unwrap_or(0);
-        let pace = Pace::of(task).steps_per_cell(longest, task.horizon);
+        let per_cell = Pace::of(task).per_cell;
         // A way that is longer than the episode may still be begun.
-        let ticks = (task.horizon / pace).max(longest.saturating_mul(2));
+        let ticks = (task.horizon / per_cell).max(longest.saturating_mul(2));
         let plan = plan(&grid, &trips, Limits { ticks, nodes: NODES, rounds: ROUNDS });
-        Ok(Self { grid, plan, pace })
+        Ok(Self { grid, plan, per_cell })
     }
 
     /// Where the path of an agent is after `step` joint steps, linear between centres; `None` once it has ended.
     fn target(&self, agent: usize, step: u32) -> Option<[f64; 2]> {
-        let (tick, rest) = ((step / self.pace) as usize, step % self.pace);
+        let (tick, rest) = ((step / self.per_cell) as usize, step % self.per_cell);
         let path = &self.plan.paths[agent];
         let [from, to] = [path.get(tick)?, path.get(tick + 1)?].map(|&cell| self.grid.centre(cell));
-        let part = f64::from(rest) / f64::from(self.pace);
+        let part = f64::from(rest) / f64::from(self.per_cell);
         Some([0, 1].map(|d| from[d] + part * (to[d] - from[d])))
     }
 }

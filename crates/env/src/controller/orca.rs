@@ -27,8 +27,8 @@ fn settings(task: &TaskConfig) -> (Settings, f64) {
         max_speed: 2.0,
     };
     match task.action_code() {
-        // An agent coasts 0.3 s and moves on for one step.
-        ActionCode::Thrust => (common, 0.4),
+        // An agent coasts 0.3 s and moves on for one step. A longer time horizon keeps agents off landmarks among parked ones.
+        ActionCode::Thrust => (Settings { time_horizon: 0.15, ..common }, 0.4),
         // The radius leaves as much room as a drone has itself, because it follows late. 0.5 s: as the scripted pilot.
         ActionCode::PerAxis => (Settings { time_step: 1.0 / 30.0, radius: 0.12, ..common }, 0.5),
     }

@@ -60,6 +60,13 @@ impl Grid {
         ax.abs_diff(bx) + ay.abs_diff(by)
     }
 
+    /// How far a cell is from the line through two others, times the distance of these.
+    pub(super) fn aside(&self, cell: u32, start: u32, goal: u32) -> u64 {
+        let [place, start, goal] = [cell, start, goal].map(|cell| self.place(cell).map(i64::from));
+        let [way, own] = [goal, place].map(|to| [to[0] - start[0], to[1] - start[1]]);
+        (way[0] * own[1] - way[1] * own[0]).unsigned_abs()
+    }
+
     /// The open cells to the right, left, above and below.
     pub(super) fn neighbours(&self, cell: u32) -> [Option<u32>; 4] {
         let [x, y] = self.place(cell);

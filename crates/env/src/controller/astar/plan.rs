@@ -113,8 +113,9 @@ struct Search<'a> {
     limits: Limits,
     reserved: Reservations,
     nodes: Vec<Node>,
-    /// (f, h, number of the node): the least estimate first, then the node nearest to the goal, then the oldest.
-    open: BinaryHeap<Reverse<(u32, u32, u32)>>,
+    /// (f, h, distance from the straight way, number): the least estimate first, then the node nearest to the goal, then the one
+    /// nearest to the line from start to goal, so that ways cross as seldom as straight lines would, then the oldest.
+    open: BinaryHeap<Reverse<(u32, u32, u64, u32)>>,
     /// Ticks at which each cell was opened, and the cells that have any.
     opened: Vec<Vec<u32>>,
     touched: Vec<u32>,
@@ -165,8 +166,9 @@ impl<'a> Search<'a> {
         self.open.clear();
         let stays_from = if around { self.reserved.free_from(goal) } else { 0 };
         // Starts are distinct: at tick 0 there is no conflict.
-        self.push(Node { cell: start, tick: 0, parent: FREE }, goal, around);
-        while let Some(Reverse((_, _, number))) = self.open.pop() {
+        let trip = (start, goal);
+        self.push(Node { cell: start, tick: 0, parent: FREE }, trip, around);
+        while let Some(Reverse((.., number))) = self.open.pop() {
             let node = self.nodes[number as usize];
             if node.cell == goal && node.tick >= stays_from {
                 return Some(self.back(number));
@@ -177,7 +179,7 @@ impl<'a> Search<'a> {
             let tick = node.tick + 1;
             for next in self.grid.neighbours(node.cell).into_iter().flatten().chain([node.cell]) {
                 if !around || self.reserved.allows(node.cell, next, tick) {
-                    self.push(Node { cell: next, tick, parent: number }, goal, around);
+                    self.push(Node { cell: next, tick, parent: number }, trip, around);
                 }
             }
         }
@@ -185,7 +187,7 @@ impl<'a> Search<'a> {
     }
 
     /// Opens a node once. A search that ignores the others has no use for coming to a cell a second time.
-    fn push(&mut self, node: Node, goal: u32, around: bool) {
+    fn push(&mut self, node: Node, (start, goal): (u32, u32), around: bool) {
         let seen = &mut self.opened[node.cell as usize];
         let known = if around { seen.contains(&node.tick) } else { !seen.is_empty() };
         let left = self.grid.manhattan(node.cell, goal);
@@ -196,7 +198,8 @@ impl<'a> Search<'a> {
             self.touched.push(node.cell);
         }
         seen.push(node.tick);
-        self.open.push(Reverse((node.tick + left, left, self.nodes.len() as u32)));
+        let aside = self.grid.aside(node.cell, start, goal);
+        self.open.push(Reverse((node.tick + left, left, aside, self.nodes.len() as u32)));
         self.nodes.push(node);
     }
 
