@@ -48,9 +48,10 @@ def drawn(name, agents, side, speed, seed):
 
 
 def circle(agents, radius):
-    angles = [2 * math.pi * k / agents + 0.01 * k for k in range(agents)]
+    angles = [2 * math.pi * k / agents + 0.05 * k for k in range(agents)]
     positions = [[radius * math.cos(a), radius * math.sin(a)] for a in angles]
-    inwards = [[-2.0 * math.cos(a), -2.0 * math.sin(a)] for a in angles]
+    # Below the largest speed: at it, rounding of the input decides which way round an agent goes.
+    inwards = [[-1.2 * math.cos(a), -1.2 * math.sin(a)] for a in angles]
     return scene("circle", positions, inwards, inwards)
 
 
@@ -60,7 +61,7 @@ SCENES = [
     scene("passed", [[0.0, 0.0], [-0.5, 0.0]], [[1.0, 0.0], [-1.0, 0.1]], [[2.0, 0.0], [-2.0, 0.0]]),
     scene("overlap", [[0.0, 0.0], [0.12, 0.05]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0], [-1.0, 0.0]]),
     scene("crossing", [[0.0, 0.0], [0.7, -0.7]], [[1.0, 0.0], [0.0, 1.0]], [[1.5, 0.0], [0.0, 1.5]]),
-    circle(8, 1.0),
+    circle(6, 1.0),
     drawn("open, 12 agents", 12, 6.0, 1.2, 1),
     drawn("busy, 25 agents", 25, 3.0, 1.4, 2),
     drawn("packed, 40 agents", 40, 1.6, 1.0, 3),

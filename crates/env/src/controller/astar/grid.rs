@@ -124,3 +124,17 @@ impl Grid {
         [cell % self.width, cell / self.width]
     }
 }
+
+#[cfg(test)]
+impl Grid {
+    /// From a drawing: `#` is blocked, the first line is the highest.
+    pub(super) fn drawn(lines: &[&str]) -> Self {
+        let (width, height) = (lines[0].len() as u32, lines.len() as u32);
+        let blocked = lines.iter().rev().flat_map(|line| line.bytes().map(|byte| byte == b'#')).collect();
+        Self { width, height, first: [0.0; 2], blocked }
+    }
+
+    pub(super) fn cell(&self, x: u32, y: u32) -> u32 {
+        x + self.width * y
+    }
+}
