@@ -192,7 +192,13 @@ fn a_frozen_graph_keeps_its_initial_convolutions() {
 
 #[test]
 fn every_scheduler_trains_and_the_learned_ones_change() {
-    for kind in [CommanderPolicy::Pairwise, CommanderPolicy::Ranking, CommanderPolicy::Exact, CommanderPolicy::Random] {
+    for kind in [
+        CommanderPolicy::Pairwise,
+        CommanderPolicy::Ranking,
+        CommanderPolicy::Exact,
+        CommanderPolicy::Greedy,
+        CommanderPolicy::Random,
+    ] {
         let mut config = small(ExecutorKind::Local, 5, 2);
         config.commander.kind = kind;
         let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
 //! The tasks: Simple Spread and Push Ball on a particle engine, drones on a rigid-body engine (paper, section 5.1). Physics,
-//! starts, reward, metrics, and the scripted controllers used as yardsticks.
+//! starts, reward, metrics, and the controllers without weights used as yardsticks.
 //!
 //! An [`Env`] is a batch of B independent episodes stepped together, particle worlds one per SIMD lane. An episode is a pure
 //! function of its task, its random stream, its goals and its actions: it gives the same bits alone, in any batch and

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`cli`], `commands` | the command line: one file per command |
 //! | [`options`], [`settings`], [`usage`], [`output`], [`failure`] | what every command shares: options, configuration, refusals, printing, exit codes |
-//! | [`local`], `evaluate` | rollouts in this process, for training and for evaluation |
+//! | [`local`], `evaluate`, `planning_clock` | rollouts in this process, for training and for evaluation |
 //! | [`supervise`] | training with learner, commander and actors as child processes |
 //! | [`folder`], `artifacts` | run folders, and the pictures in them |
 

@@ -153,6 +153,48 @@ fn a_run_leaves_its_folder_and_can_be_evaluated_and_replayed() {
 }
 
 #[test]
+fn controllers_and_schedulers_without_weights_need_no_run() {
+    let place = Place::new();
+    let eval = |options: &str| place.json(&format!("eval tiny.toml --episodes 20 {options}"));
+    for (controller, success) in [
+        ("scripted", 0.95..=1.0),
+        ("astar", 0.99..=1.0),
+        ("orca", 0.95..=1.0),
+        ("nearest", 0.5..=0.9),
+        ("random", 0.0..=0.2),
+    ] {
+        let result = eval(&format!("--controller {controller} --scheduler greedy"));
+        assert_eq!((&result["controller"], &result["scheduler"]), (&controller.into(), &"greedy".into()));
+        assert!(result["weights_sha256"].is_null() && result["weights_final"] == false);
+        let mean = &result["mean"]["greedy"];
+        assert!(success.contains(&mean["success_rate"].as_f64().unwrap()), "{controller}: {mean}");
+        assert!(mean["planning_ms"].as_f64().unwrap() > 0.0 && result["rows"][0]["planning_ms"].is_number());
+        // Neither shards nor threads change a number that is not a time.
+        let again = eval(&format!("--controller {controller} --scheduler greedy --threads 1 --record look.html"));
+        for metric in ["success_rate", "arrival_step", "collisions_per_agent_step", "reward"] {
+            assert_eq!(again["mean"]["greedy"][metric], mean[metric], "{controller}");
+        }
+    }
+    let cost = |scheduler: &str| {
+        let result = eval(&format!("--controller scripted --scheduler {scheduler}"));
+        result["mean"]["greedy"]["cost_ratio"].as_f64().unwrap()
+    };
+    let [exact, greedy, random] = ["exact", "greedy", "random"].map(cost);
+    assert!(exact == 1.0 && exact < greedy && greedy < random, "{exact} {greedy} {random}");
+    place.json("replay tiny.toml --controller astar --scheduler greedy --episodes 1 --out page.html");
+    assert!(fs::read_to_string(place.path("page.html")).unwrap().contains("astar controller"));
+
+    // Training and its services hand out greedy goals, too.
+    fs::write(place.path("greedy.toml"), format!("{TINY}\n[commander]\nkind = 'greedy'")).unwrap();
+    let alone = place.json("train greedy.toml --in-process --out alone");
+    assert!(alone["cost_ratio"].as_f64().unwrap() > 1.0);
+    let services = place.json("train greedy.toml --out services --actors 1");
+    assert_eq!(alone["weights_sha256"], services["weights_sha256"]);
+    let learned = place.json("eval alone --episodes 2");
+    assert!(learned["mean"]["greedy"].get("planning_ms").is_none() && learned["scheduler"] == "greedy");
+}
+
+#[test]
 fn services_give_the_weights_of_one_process() {
     let place = Place::new();
     let alone = place.trained("alone");
@@ -224,6 +266,7 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
     fs::create_dir(place.path("full")).unwrap();
     fs::write(place.path("full/notes.txt"), "").unwrap();
     fs::write(place.path("token"), "secret").unwrap();
+    fs::write(place.path("push.toml"), "[task]\nname = 'push-ball'\nagents = 5\nspawn = 'uniform'").unwrap();
     for (line, code, words) in [
         ("", 64, &["Usage"] as &[&str]),
         ("train --frobnicate", 64, &["--frobnicate"]),
@@ -248,8 +291,17 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("eval run --seeds 1,2", 64, &["--seeds", "--episode-seeds"]),
         ("bench env --json", 64, &["cargo run --release -p magex-bench -- env --json"]),
         ("eval run --episodes 0", 64, &["--episodes"]),
-        ("eval run --scheduler ranking", 64, &["use pairwise, exact or random"]),
+        ("eval run --scheduler ranking", 64, &["use pairwise, exact, greedy or random"]),
         ("eval run --per-layout", 64, &["--spawn lines"]),
+        ("eval run --controller fastest", 64, &["fastest", "astar", "orca"]),
+        ("eval run --scheduler nearest", 64, &["nearest", "greedy"]),
+        ("eval tiny.toml --scheduler exact", 64, &["tiny.toml", "not weights", "--controller learned", "orca"]),
+        ("eval tiny.toml --controller astar", 64, &["tiny.toml", "pairwise scheduler", "--scheduler exact, greedy"]),
+        ("eval tiny.toml --controller astar --scheduler exact --strict", 64, &["--strict", "no weights"]),
+        ("eval range.toml --controller astar --scheduler exact", 64, &["range.toml", "mappo.gamma"]),
+        ("eval none.toml --controller astar --scheduler exact", 64, &["none.toml does not exist"]),
+        ("eval push.toml --controller astar --scheduler exact", 64, &["--controller", "push-ball", "use scripted"]),
+        ("replay push.toml --controller orca --scheduler exact", 64, &["--controller", "push-ball", "use scripted"]),
         ("eval run/weights.safetensors", 64, &["--config"]),
         ("replay run --out full/notes.txt/page.html --episodes 1", 73, &["full/notes.txt is not a folder"]),
         ("eval run --record full --episodes 1", 73, &["full is a folder"]),

@@ -83,11 +83,6 @@ impl Astar {
     pub fn new(task: &TaskConfig) -> Self {
         Self { task: task.clone(), courses: Vec::new(), step: 0 }
     }
-
-    /// Agents whose path ignores the others, because no path around them was found, over all episodes.
-    pub fn unresolved(&self) -> usize {
-        self.courses.iter().map(|course| course.plan.unresolved.len()).sum()
-    }
 }
 
 impl Controller for Astar {
