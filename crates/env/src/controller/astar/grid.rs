@@ -29,14 +29,15 @@ impl Grid {
         loop {
             let first = [0, 1].map(|d| ((least(d) - margin) / CELL).floor());
             let [width, height] = [0, 1].map(|d| ((most(d) + margin) / CELL).ceil() - first[d] + 1.0);
-            if !(width * height <= CELLS_MAX) {
+            let cells = width * height;
+            if cells.is_nan() || cells > CELLS_MAX {
                 let problem = format!(
                     "the map has {width} x {height} cells of {CELL} for astar, which plans on up to {CELLS_MAX}; \
                      use a smaller map, or the controller orca or scripted"
                 );
                 return Err(FieldError::new("task.side", problem));
             }
-            if width * height >= 2.0 * points.len() as f64 {
+            if cells >= 2.0 * points.len() as f64 {
                 let (width, height) = (width as u32, height as u32);
                 return Ok(Self { width, height, first, blocked: vec![false; width as usize * height as usize] });
             }
