@@ -40,6 +40,8 @@ pub enum Purpose {
     EvalGraph = 13,
     /// Whether a training episode's goals are a random matching, and which; indices: iteration, episode.
     RandomGoals = 14,
+    /// Resamples of the bootstrap; indices: resample, system, task.
+    Bootstrap = 31,
 }
 
 /// The name of a stream.
