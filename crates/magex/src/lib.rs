@@ -6,6 +6,7 @@
 //! | [`options`], [`settings`], [`usage`], [`output`], [`failure`] | what every command shares: options, configuration, refusals, printing, exit codes |
 //! | [`local`], `evaluate` | rollouts in this process, for training and for evaluation |
 //! | [`supervise`] | training with learner, commander and actors as child processes |
+//! | `training`, `runs` | one training run in its folder; runs as they are compared |
 //! | [`folder`], `artifacts` | run folders, and the pictures in them |
 
 pub mod cli;
@@ -25,4 +26,6 @@ mod logging;
 mod parallel;
 mod parent_watch;
 mod progress;
+mod runs;
 mod synthetic;
+mod training;
