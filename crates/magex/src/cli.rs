@@ -1,6 +1,6 @@
 //! The command line: commands and exit codes.
 
-use crate::commands::{assign, bench, compare, eval, health, replay, roles, train, train_commander, verify};
+use crate::commands::{assign, bench, compare, eval, health, replay, reproduce, roles, train, train_commander, verify};
 use crate::failure;
 use crate::options::CommonOptions;
 use crate::output::note;
@@ -44,6 +44,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Replay(replay::ReplayArgs),
     Compare(compare::CompareArgs),
+    Reproduce(reproduce::ReproduceArgs),
     Assign(assign::AssignArgs),
     Bench(bench::BenchArgs),
     Verify(verify::VerifyArgs),
@@ -82,6 +83,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args, &options),
         Command::Replay(args) => replay::run(args, &options),
         Command::Compare(args) => compare::run(args, &options),
+        Command::Reproduce(args) => reproduce::run(args, &options),
         Command::Assign(args) => assign::run(args, &options),
         Command::Bench(args) => Ok(bench::run(args, &options)),
         Command::Verify(args) => verify::run(args, &options),

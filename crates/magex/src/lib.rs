@@ -7,6 +7,7 @@
 //! | [`local`], `evaluate` | rollouts in this process, for training and for evaluation |
 //! | [`supervise`] | training with learner, commander and actors as child processes |
 //! | `training`, `runs` | one training run in its folder; runs as they are compared |
+//! | `reproduce` | the paper's tables, trained and measured anew |
 //! | [`folder`], `artifacts` | run folders, and the pictures in them |
 
 pub mod cli;
@@ -26,6 +27,7 @@ mod logging;
 mod parallel;
 mod parent_watch;
 mod progress;
+mod reproduce;
 mod runs;
 mod synthetic;
 mod training;

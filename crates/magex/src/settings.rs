@@ -97,8 +97,18 @@ pub(crate) fn read_from(option: &str, path: &Path) -> anyhow::Result<RunConfig> 
     RunConfig::from_toml(&text).with_context(|| format!("{option} {}", path.display()).trim_start().to_owned())
 }
 
+/// A configuration as JSON, by its text: single-precision numbers print as they are written.
+pub(crate) fn as_json(config: &RunConfig) -> anyhow::Result<Value> {
+    Ok(serde_json::from_str(&serde_json::to_string(config)?)?)
+}
+
 /// Every key of a configuration with its value, as they are written.
 pub(crate) fn flat(config: &RunConfig) -> anyhow::Result<BTreeMap<String, String>> {
+    Ok(flat_value(&as_json(config)?))
+}
+
+/// [`flat`] of [`as_json`].
+pub(crate) fn flat_value(config: &Value) -> BTreeMap<String, String> {
     fn leaves(path: &str, value: &Value, found: &mut BTreeMap<String, String>) {
         match value {
             Value::Object(section) => {
@@ -110,9 +120,15 @@ pub(crate) fn flat(config: &RunConfig) -> anyhow::Result<BTreeMap<String, String
         }
     }
     let mut found = BTreeMap::new();
-    // By its text: single-precision numbers print as they are written.
-    leaves("", &serde_json::from_str(&serde_json::to_string(config)?)?, &mut found);
-    Ok(found)
+    leaves("", config, &mut found);
+    found
+}
+
+/// `run.seed is 1, not 2` for every key that differs.
+pub(crate) fn changes(own: &BTreeMap<String, String>, asked: &BTreeMap<String, String>) -> Vec<String> {
+    let value = |of: &BTreeMap<String, String>, key: &String| of.get(key).cloned().unwrap_or_else(|| "not set".into());
+    let keys = differing([own, asked]).into_iter();
+    keys.map(|key| format!("{key} is {}, not {}", value(own, &key), value(asked, &key))).collect()
 }
 
 /// The keys whose values are not the same everywhere.

@@ -15,7 +15,6 @@ use magex_learner::run_start::Parent;
 use magex_runtime::process::processors;
 use magex_runtime::{exit, options as parse, server, shutdown};
 use report::{Finished, resume, say_stopped};
-use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use tokio::runtime::Runtime;
@@ -121,7 +120,7 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
     let config = &configured.config;
     if args.print_config {
         output.say(config.to_toml()?.trim_end());
-        output.result(&as_json(config)?);
+        output.result(&settings::as_json(config)?);
         return Ok(exit::OK);
     }
     let (runtime, interrupted) = prepare_process()?;
@@ -197,11 +196,6 @@ fn read(args: &TrainArgs) -> anyhow::Result<Configured> {
         None => config,
     };
     Ok(Configured { config, parent, whole_budget })
-}
-
-/// By its text: single-precision numbers print as they are written.
-fn as_json(config: &RunConfig) -> anyhow::Result<Value> {
-    Ok(serde_json::from_str(&serde_json::to_string(config)?)?)
 }
 
 /// What trains, and what the head of the run says of it.

@@ -114,7 +114,7 @@ fn draw(svg: &mut Svg, panel: &Panel, names: &[&str], head: f64) -> f64 {
         svg.line([x.at(tick), top], [x.at(tick), bottom]);
         svg.text([x.at(tick), bottom + 17.0], "middle", "soft label", &short_count(tick));
     }
-    let log = if x.log { " over joint environment steps, log scale" } else { " over joint environment steps" };
+    let log = if x.log { ", over joint environment steps, log scale" } else { ", over joint environment steps" };
     svg.text([MARGIN, head + 12.0], "start", "ink title", &format!("{}{log}", panel.title));
     let width = (WIDTH - 2.0 * MARGIN) / COLUMNS as f64;
     for (k, curve) in panel.curves.iter().enumerate() {
