@@ -183,25 +183,32 @@ fn measure_missing(args: &ReproduceArgs, budget: &Budget, out: &Path, jobs: &mut
     let place = Place { out, threads, episodes: budget.episodes, runtime: &runtime, interrupted: &interrupted };
     let count = jobs.len();
     let mut complete = true;
-    for (k, job) in jobs.iter_mut().enumerate().filter(|(_, job)| job.record.is_none()) {
-        let (cell, seed) = (&job.cell, job.seed);
+    for k in (0..count).filter(|&k| jobs[k].record.is_none()).collect::<Vec<_>>() {
+        let Job { cell, seed, .. } = &jobs[k];
         let what = format!("{} · {} · N = {} · seed {seed}", cell.table.name, cell.system.name, cell.agents());
         note(format!("{what} ({} of {count})", k + 1));
-        let measured = if interrupted.is_cancelled() { None } else { measure(&place, cell, seed)? };
+        let known =
+            jobs.iter().find_map(|job| job.record.as_ref().filter(|_| job.seed == *seed && job.cell.same(cell)));
+        let measured = match known {
+            Some(record) => Some(record.in_table(cell)),
+            None if interrupted.is_cancelled() => None,
+            None => measure(&place, cell, *seed)?,
+        };
         let Some(record) = measured else {
             complete = false;
             break;
         };
+        let again = known.map(|record| format!(", as in {}", record.table)).unwrap_or_default();
         note(format!(
-            "  success {} greedy, {} sampled; {} steps in {}, ended by {}",
+            "  success {} greedy, {} sampled; {} steps in {}, ended by {}{again}",
             share(average(&record.greedy.success_rate)),
             share(average(&record.sampled.success_rate)),
             thousands(record.joint_env_steps as f64),
             seconds(record.wall_s),
             record.ended_by.words()
         ));
-        record::write(&record::path(out, cell, seed), &record)?;
-        job.record = Some(record);
+        record::write(&record::path(out, cell, *seed), &record)?;
+        jobs[k].record = Some(record);
     }
     runtime.shutdown_background();
     Ok(complete)

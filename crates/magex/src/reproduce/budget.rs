@@ -64,6 +64,15 @@ impl Cell {
         self.config.task.agents
     }
 
+    /// Whether both are the same training or controller on the same task: tables share cells.
+    pub(crate) fn same(&self, other: &Self) -> bool {
+        let by = match (&self.system.by, &other.system.by) {
+            (By::Learner { .. }, By::Learner { .. }) => true,
+            (own, other) => own == other,
+        };
+        by && self.config == other.config && self.wall_s == other.wall_s
+    }
+
     /// `<system>-<N>`, the name of folders and files.
     pub(crate) fn id(&self) -> String {
         format!("{}-{}", self.system.id, self.agents())

@@ -78,7 +78,7 @@ pub(crate) fn measure(place: &Place<'_>, cell: &Cell, seed: u64) -> anyhow::Resu
         joint_env_steps: 0,
         wall_s: 0.0,
         ended_by: EndedBy::NoTraining,
-        converged: true,
+        converged: None,
         eval_set: EVAL_SET,
         greedy: Evaluated::default(),
         sampled: Evaluated::default(),
@@ -102,7 +102,7 @@ pub(crate) fn measure(place: &Place<'_>, cell: &Cell, seed: u64) -> anyhow::Resu
                 Some(_) => EndedBy::Steps,
                 None => EndedBy::Time,
             };
-            record.converged = record.ended_by == EndedBy::Target || flat;
+            record.converged = if record.ended_by == EndedBy::Target { Some(true) } else { flat };
             (record.joint_env_steps, record.wall_s, record.curve) = (run.steps(), run.wall_s(), curve);
             record.weights_sha256 = Some(trained.sha256);
             (record.greedy, record.sampled) = evaluate(place, &config, &Variation::default(), &trained.weights)?;

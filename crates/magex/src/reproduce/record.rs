@@ -36,7 +36,8 @@ pub(crate) struct Record {
     /// Seconds of training.
     pub(crate) wall_s: f64,
     pub(crate) ended_by: EndedBy,
-    pub(crate) converged: bool,
+    /// `None` where too few evaluations say nothing of it, and of controllers.
+    pub(crate) converged: Option<bool>,
     pub(crate) eval_set: u32,
     pub(crate) greedy: Evaluated,
     pub(crate) sampled: Evaluated,
@@ -131,14 +132,19 @@ impl Record {
         Ok(settings::changes(&settings::flat_value(&self.config), &settings::flat(config)?))
     }
 
+    /// The same measurement as a cell of another table.
+    pub(crate) fn in_table(&self, cell: &Cell) -> Self {
+        Self { table: cell.table.name.to_owned(), system: cell.system.id.to_owned(), ..self.clone() }
+    }
+
     /// The seed's points as [joint steps, greedy success].
     pub(crate) fn success_curve(&self) -> Vec<[f64; 2]> {
         self.curve.iter().map(|point| [point.joint_env_steps as f64, point.success_rate]).collect()
     }
 }
 
-/// The curve of a run, thinned to [`POINTS`], and whether it had become flat.
-pub(crate) fn curve_of(run: &SeedRun) -> (Vec<CurvePoint>, bool) {
+/// The curve of a run, thinned to [`POINTS`], and whether it had become flat, if there are enough evaluations to tell.
+pub(crate) fn curve_of(run: &SeedRun) -> (Vec<CurvePoint>, Option<bool>) {
     let success = &METRICS[SUCCESS_RATE];
     let points: Vec<CurvePoint> = run
         .lines
@@ -165,13 +171,13 @@ fn thinned(points: &[CurvePoint]) -> Vec<CurvePoint> {
     (0..POINTS).map(|k| points[k * last / (POINTS - 1)]).collect()
 }
 
-fn flat(values: &[f64]) -> bool {
+fn flat(values: &[f64]) -> Option<bool> {
     let quarter = values.len() / 4;
     let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
-    values.len() >= FEW && {
+    (values.len() >= FEW).then(|| {
         let (before, last) = (values.len() - 2 * quarter, values.len() - quarter);
         (mean(&values[last..]) - mean(&values[before..last])).abs() < FLAT
-    }
+    })
 }
 
 #[cfg(test)]
@@ -181,9 +187,9 @@ mod tests {
     #[test]
     fn a_curve_is_flat_when_its_last_quarters_agree() {
         let rising: Vec<f64> = (0..40).map(|k| f64::from(k) / 40.0).collect();
-        assert!(!flat(&rising) && !flat(&[1.0; 7]) && flat(&[1.0; 8]));
+        assert_eq!([flat(&rising), flat(&[1.0; 7]), flat(&[1.0; 8])], [Some(false), None, Some(true)]);
         let saturated: Vec<f64> = (0..40).map(|k| (f64::from(k) / 10.0).min(0.9)).collect();
-        assert!(flat(&saturated));
+        assert_eq!(flat(&saturated), Some(true));
     }
 
     #[test]

@@ -75,10 +75,6 @@ impl Measured {
         average(&self.records.iter().map(|record| record.wall_s).collect::<Vec<_>>())
     }
 
-    pub(crate) fn converged(&self) -> usize {
-        self.records.iter().filter(|record| record.converged).count()
-    }
-
     /// Why the trainings ended, each reason once.
     pub(crate) fn ended_by(&self) -> String {
         let reasons = [EndedBy::Target, EndedBy::Steps, EndedBy::Time, EndedBy::NoTraining];
@@ -86,12 +82,11 @@ impl Measured {
         reasons.into_iter().filter(there).map(EndedBy::words).collect::<Vec<_>>().join(", ")
     }
 
-    /// `2/3`, or a dash where nothing is trained.
-    pub(crate) fn converged_of(&self) -> String {
-        match self.records.iter().all(|record| record.ended_by == EndedBy::NoTraining) {
-            true => "–".into(),
-            false => format!("{}/{}", self.converged(), self.records.len()),
-        }
+    /// `2/3` of the seeds of which it is known, or a dash where it is known of none.
+    pub(crate) fn converged(&self) -> String {
+        let known: Vec<bool> = self.records.iter().filter_map(|record| record.converged).collect();
+        let converged = known.iter().filter(|&&converged| converged).count();
+        if known.is_empty() { "–".into() } else { format!("{converged}/{}", known.len()) }
     }
 }
 

@@ -84,45 +84,43 @@ const SPREAD: &[Task] = &[
     Task { agents: 50, config: SPREAD_50 },
 ];
 /// MAGE-X on the paper's three sizes of Simple Spread.
-const MAGE_X_SPREAD: System = System {
-    name: "MAGE-X",
-    id: "mage-x",
-    by: By::Learner { configs: &[SPREAD_5, SPREAD_20, SPREAD_50], set: &[] },
-    paper: &[success(1.00, 0.01), success(1.00, 0.01), success(1.00, 0.01)],
-};
+const MAGE_X_SPREAD: System = learner(
+    "MAGE-X",
+    "mage-x",
+    &[SPREAD_5, SPREAD_20, SPREAD_50],
+    &[],
+    &[success(1.00, 0.01), success(1.00, 0.01), success(1.00, 0.01)],
+);
 
 /// Every table, in the order of the paper.
+#[rustfmt::skip]
 pub(crate) const TABLES: &[PaperTable] = &[
     PaperTable {
         name: "spread",
         title: "Simple Spread",
         source: "main results, Simple Spread",
         tasks: SPREAD,
-        systems: &[MAGE_X_SPREAD],
+        systems: &[
+            MAGE_X_SPREAD,
+        ],
     },
     PaperTable {
         name: "push-ball",
         title: "Push Ball",
         source: "main results, Push Ball",
         tasks: &[Task { agents: 5, config: PUSH_BALL_5 }, Task { agents: 20, config: PUSH_BALL_20 }],
-        systems: &[System {
-            name: "MAGE-X",
-            id: "mage-x",
-            by: By::Learner { configs: &[PUSH_BALL_5, PUSH_BALL_20], set: &[] },
-            paper: &[success(1.00, 0.01), success(1.00, 0.01)],
-        }],
+        systems: &[
+            learner("MAGE-X", "mage-x", &[PUSH_BALL_5, PUSH_BALL_20], &[], &[success(1.00, 0.01), success(1.00, 0.01)]),
+        ],
     },
     PaperTable {
         name: "drones",
         title: "Drones",
         source: "main results, Drones",
         tasks: &[Task { agents: 2, config: DRONES_2 }, Task { agents: 4, config: DRONES_4 }],
-        systems: &[System {
-            name: "MAGE-X",
-            id: "mage-x",
-            by: By::Learner { configs: &[DRONES_2, DRONES_4], set: &[] },
-            paper: &[drones([0.95, 0.03], [0.02, 0.01]), drones([0.79, 0.07], [0.12, 0.01])],
-        }],
+        systems: &[
+            learner("MAGE-X", "mage-x", &[DRONES_2, DRONES_4], &[], &[drones([0.95, 0.03], [0.02, 0.01]), drones([0.79, 0.07], [0.12, 0.01])]),
+        ],
     },
     PaperTable {
         name: "ablation",
@@ -130,10 +128,10 @@ pub(crate) const TABLES: &[PaperTable] = &[
         source: "ablation study",
         tasks: &[Task { agents: 50, config: SPREAD_50 }],
         systems: &[
-            ablation("MAGE-X", "mage-x", &[], &[success(1.00, 0.01)]),
-            ablation("MAGE-X w. RG", "mage-x-rg", &["commander.kind=random"], &[success(0.83, 0.01)]),
-            ablation("MAGE-X-Atten", "mage-x-atten", &["executor.kind=attention"], &[success(0.93, 0.01)]),
-            ablation("MAGE-X-MLP", "mage-x-mlp", &["executor.kind=mlp"], &[success(0.50, 0.08)]),
+            learner("MAGE-X", "mage-x", &[SPREAD_50], &[], &[success(1.00, 0.01)]),
+            learner("MAGE-X w. RG", "mage-x-rg", &[SPREAD_50], &["commander.kind=random"], &[success(0.83, 0.01)]),
+            learner("MAGE-X-Atten", "mage-x-atten", &[SPREAD_50], &["executor.kind=attention"], &[success(0.93, 0.01)]),
+            learner("MAGE-X-MLP", "mage-x-mlp", &[SPREAD_50], &["executor.kind=mlp"], &[success(0.50, 0.08)]),
         ],
     },
     PaperTable {
@@ -143,18 +141,23 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: SPREAD,
         systems: &[
             MAGE_X_SPREAD,
-            System { name: "scripted", id: "scripted", by: By::Controller(Controller::Scripted), paper: &[] },
+            controller("scripted", "scripted", Controller::Scripted, &[]),
         ],
     },
 ];
 
-const fn ablation(
+const fn learner(
     name: &'static str,
     id: &'static str,
+    configs: &'static [&'static str],
     set: &'static [&'static str],
     paper: &'static [Paper],
 ) -> System {
-    System { name, id, by: By::Learner { configs: &[SPREAD_50], set }, paper }
+    System { name, id, by: By::Learner { configs, set }, paper }
+}
+
+const fn controller(name: &'static str, id: &'static str, by: Controller, paper: &'static [Paper]) -> System {
+    System { name, id, by: By::Controller(by), paper }
 }
 
 #[cfg(test)]

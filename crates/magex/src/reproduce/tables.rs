@@ -80,7 +80,8 @@ pub(crate) fn markdown(budget: &Budget, tables: &[(&'static PaperTable, Vec<Meas
         IQM is the interquartile mean; below four numbers it is their mean.\n\
         Brackets: 95 % interval of the stratified percentile bootstrap over the seeds.\n\
         Steps: joint environment steps trained on, mean over the seeds; what ended the training stands beside it.\n\
-        Converged: seeds that reached the target, or whose greedy success changed by less than 0.01 in the last half.\n";
+        Converged: seeds that reached the target, or whose mean greedy success of the last quarter of the \
+        evaluations differs by less than 0.01 from that of the quarter before; a dash: fewer than 8 evaluations.\n";
     if missing > 0 {
         let _ = writeln!(text, "{missing} trainings of this budget are not measured and are left out.");
     }
@@ -118,7 +119,7 @@ fn cells(text: &mut String, measured: &[Measured]) {
             cells.push(optional(one.collisions().map(spread)));
             cells.push(optional(one.paper().and_then(|value| value.collisions).map(paper)));
         }
-        cells.extend([thousands(one.steps()), one.ended_by(), one.converged_of(), seconds(one.wall_s())]);
+        cells.extend([thousands(one.steps()), one.ended_by(), one.converged(), seconds(one.wall_s())]);
         row(text, &cells);
     }
 }
@@ -194,7 +195,7 @@ pub(crate) fn csv(tables: &[(&'static PaperTable, Vec<Measured>)]) -> String {
             number(crashed.map(|[mean, _]| mean)),
             number(crashed.map(|[_, deviation]| deviation)),
             number(Some(one.steps())),
-            one.converged_of(),
+            one.converged(),
             one.ended_by(),
             number(Some(one.wall_s())),
         ]);
