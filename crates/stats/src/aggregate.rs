@@ -30,12 +30,12 @@ pub fn optimality_gap(scores: &Scores, target: f64) -> f64 {
     target - average(&reached)
 }
 
-/// Mean of numbers [n]; NaN without any.
+/// Mean of numbers `[n]`; NaN without any.
 pub fn average(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// Sample standard deviation of numbers [n], with n − 1 in the denominator. `None` below two numbers.
+/// Sample standard deviation of numbers `[n]`, with n − 1 in the denominator. `None` below two numbers.
 pub fn standard_deviation(values: &[f64]) -> Option<f64> {
     let mean = average(values);
     let squares: f64 = values.iter().map(|value| (value - mean) * (value - mean)).sum();

@@ -14,7 +14,7 @@ pub struct BandPoint {
 }
 
 /// The mean of curves with a band from the lowest to the highest, at every place that a curve has a point. A curve is a list of
-/// [x, y] with rising x; between its points it is a straight line, before the first one it is not there, and behind the last one
+/// `[x, y]` with rising x; between its points it is a straight line, before the first one it is not there, and behind the last one
 /// it keeps its value: a run that has reached its target stays as good as it is.
 pub fn band(curves: &[Vec<[f64; 2]>]) -> Vec<BandPoint> {
     let mut places: Vec<f64> = curves.iter().flatten().map(|&[x, _]| x).collect();

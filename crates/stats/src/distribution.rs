@@ -3,7 +3,7 @@
 use crate::aggregate::average;
 use crate::scores::{Scores, ScoresError};
 
-/// Performance profile: for every threshold τ the share of all runs × tasks whose score is strictly above it; [T] for [T]
+/// Performance profile: for every threshold τ the share of all runs × tasks whose score is strictly above it; `[T]` for `[T]`
 /// thresholds.
 pub fn performance_profile(scores: &Scores, thresholds: &[f64]) -> Vec<f64> {
     let count = scores.flat().count() as f64;

@@ -17,7 +17,7 @@ pub enum ScoresError {
     OtherTasks(usize, usize),
 }
 
-/// Scores [K tasks][R runs], all finite; tasks may differ in the number of their runs.
+/// Scores `[K tasks][R runs]`, all finite; tasks may differ in the number of their runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scores(Vec<Vec<f64>>);
 
@@ -46,7 +46,7 @@ impl Scores {
         &self.0
     }
 
-    /// All scores, task by task: [Σ R].
+    /// All scores, task by task: `[Σ R]`.
     pub fn flat(&self) -> impl Iterator<Item = f64> {
         self.0.iter().flatten().copied()
     }

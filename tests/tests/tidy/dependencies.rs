@@ -41,7 +41,7 @@ fn dependencies_point_down_only() {
         ("magex-runtime", &["magex-core", "magex-env", "magex-nets", "magex-proto", "rapier3d"]),
         ("magex-viewer", &["magex-assign", "magex-env", "magex-nets", "magex-learner", "rapier3d"]),
         ("magex-verify", &["magex-nets", "magex-proto", "magex-runtime"]),
-        ("magex-stats", &["magex-env", "magex-nets", "magex-proto", "magex-runtime", "serde_json"]),
+        ("magex-stats", &["magex-env", "magex-nets", "magex-proto", "magex-runtime", "rapier3d"]),
         ("magex", &["magex-bench"]),
         ("magex-learner", &["magex-env", "rapier3d"]),
         ("magex-commander", &["magex-env", "rapier3d"]),
