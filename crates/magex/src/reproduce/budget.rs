@@ -93,10 +93,14 @@ impl Budget {
         for task in tasks {
             for system in table.systems {
                 let (text, set) = match &system.by {
-                    By::Learner { configs, set } => (configs[task], *set),
+                    By::Learner { configs, set } => (*configs.get(task).unwrap_or(&configs[0]), *set),
                     By::Controller(_) => (table.tasks[task].config, &[] as &[&str]),
                 };
-                let settings: Result<Vec<Setting>, String> = set.iter().map(|setting| setting.parse()).collect();
+                let own = RunConfig::from_toml(table.tasks[task].config)?.task;
+                let task_keys =
+                    [format!("name={}", own.name), format!("agents={}", own.agents), format!("spawn={}", own.spawn)];
+                let all = set.iter().map(|key| (*key).to_owned()).chain(task_keys.map(|key| format!("task.{key}")));
+                let settings: Result<Vec<Setting>, String> = all.map(|setting| setting.parse()).collect();
                 let settings = settings.map_err(anyhow::Error::msg)?;
                 let named = || format!("{}, {} with {} agents", table.name, system.name, table.tasks[task].agents);
                 let mut config = RunConfig::from_toml_with(text, &settings).with_context(named)?;
