@@ -65,6 +65,8 @@ fn base(command: &str) -> &'static str {
         "train-commander" => "train-commander --out new",
         "eval" => "eval {f}/run --episodes 1",
         "replay" => "replay {f}/run --episodes 1 --out new.html",
+        "compare" => "compare {f}/run",
+        "reproduce" => "reproduce --tables-only --out {f}/none",
         "assign" => "assign --random 2 --connect http://127.0.0.1:9",
         "health" => "health http://127.0.0.1:9",
         _ => "verify {f}/run",
@@ -113,7 +115,9 @@ fn options() -> Vec<Row> {
     for command in definition.get_subcommands().filter(|sub| !["help", "bench"].contains(&sub.get_name())) {
         let name = command.get_name();
         rows.push(row(&format!("{name} --no-such-option"), 64, &["--no-such-option", &format!("magex {name} --help")]));
-        rows.push(row(&format!("{} too many arguments", base(name)), 64, &["one argument too many"]));
+        // It takes any number of runs.
+        let too_many = if name == "compare" { "does not exist" } else { "one argument too many" };
+        rows.push(row(&format!("{} too many arguments", base(name)), 64, &[too_many]));
         for argument in command.get_arguments().filter(|argument| !argument.is_hide_set()) {
             let Some(long) = argument.get_long().filter(|long| !["help", "version", "verbose"].contains(long)) else {
                 continue;
@@ -251,7 +255,13 @@ fn by_hand() -> Vec<Row> {
         ("train {f}/chunk.toml", 64, &["mappo.chunk_length", "divide"]),
         ("train --seed 9223372036854775808", 64, &["--seed", "0 to 9223372036854775807"]),
         ("train --max-steps 99999999999999999999", 64, &["--max-steps", "1 to 1000000000000"]),
-        ("train --set run.seed=1", 64, &["--set"]),
+        ("train --set run.seed", 64, &["--set", "KEY=VALUE"]),
+        ("train --set run.sed=1 --print-config", 64, &["--set", "run.sed", "use seed"]),
+        ("train --set run.seed=five --print-config", 64, &["--set", "run.seed", "a whole number"]),
+        ("train {f}/ring.toml --set run.seed=1", 64, &["ring.toml", "task.spawn"]),
+        ("train --seeds 1,2 --seed 3", 64, &["--seeds", "--seed", "leave one out"]),
+        ("train --seeds 1,2,1", 64, &["--seeds", "1 is named twice"]),
+        ("train --seeds 1 --resume --out {f}/none", 64, &["{f}/none", "does not exist"]),
         ("train --name ../up", 64, &["--name", "../up"]),
         ("train --name ''", 64, &["--name"]),
         ("train --name a --out b", 64, &["--name", "--out"]),
@@ -289,6 +299,21 @@ fn by_hand() -> Vec<Row> {
         ("replay {f}/run --episodes 101", 64, &["--episodes", "1 to 100"]),
         ("replay {f}/run --episodes 1 --out /proc/new.html", 73, &["/proc/new.html"]),
         ("replay {f}/run --episodes 1 --out {f}/noise/below/x.html", 73, &["{f}/noise/below"]),
+        ("compare", 64, &["<RUN>"]),
+        ("compare {f}/none", 64, &["{f}/none", "does not exist"]),
+        ("compare {f}/noise", 64, &["{f}/noise"]),
+        ("compare {f}/folder", 64, &["{f}/folder", "not a run folder"]),
+        ("compare {f}/run {f}/run", 64, &["{f}/run", "named twice"]),
+        ("compare {f}/run --svg {f}/folder", 73, &["{f}/folder"]),
+        ("compare {f}/run --csv /proc/new.csv", 73, &["/proc/new.csv"]),
+        ("reproduce --table none", 64, &["--table", "spread"]),
+        ("reproduce --systems none", 64, &["--systems", "mage-x"]),
+        ("reproduce --seeds 1,1", 64, &["--seeds", "1 is named twice"]),
+        ("reproduce --max-minutes 0", 64, &["--max-minutes", "0.001"]),
+        ("reproduce --tables-only --out {f}/none", 64, &["{f}/none", "does not exist"]),
+        ("reproduce --tables-only --out {f}/folder", 64, &["{f}/folder", "no results"]),
+        ("reproduce --out {f}/noise", 73, &["{f}/noise"]),
+        ("reproduce --out /proc/new", 73, &["/proc/new"]),
         ("assign", 64, &["--agents"]),
         ("assign --agents five", 64, &["--agents five", "no such file"]),
         ("assign --agents ''", 64, &["--agents"]),

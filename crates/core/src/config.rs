@@ -5,6 +5,7 @@
 
 mod executor;
 mod raw;
+mod setting;
 
 use crate::error::{FieldError, UnknownName, check_range};
 use crate::section::section;
@@ -13,6 +14,7 @@ use serde::de::IntoDeserializer as _;
 use serde::{Deserialize, Serialize};
 
 pub use executor::{ExecutorConfig, ExecutorKind, Observes};
+pub use setting::Setting;
 
 /// Why a configuration was refused: it is not TOML, or has a key that does not exist, or a value of the wrong type or out of
 /// its range.
@@ -249,7 +251,16 @@ impl RunConfig {
     /// Reads TOML; missing keys take their defaults, or the values of the first run ([`RunConfig::default`]) if there is no
     /// `[task]`; unknown keys and values out of range are errors.
     pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
-        raw::read(text)?.validated()
+        Self::from_toml_with(text, &[])
+    }
+
+    /// [`Self::from_toml`] with some keys changed: what the file derives from a key, it derives from the changed one. A later
+    /// setting of the same key wins.
+    ///
+    /// # Errors
+    /// Those of a file that has these keys.
+    pub fn from_toml_with(text: &str, settings: &[Setting]) -> Result<Self, ConfigError> {
+        raw::read(text, settings)?.validated()
     }
 
     /// The same configuration if every value is in its range.

@@ -88,3 +88,12 @@ pub(crate) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
         .inspect_err(|_| drop(std::fs::remove_file(&temporary)))
         .map_err(|error| cannot_create(format!("{}: {error}", path.display())))
 }
+
+/// Rows as CSV, quoted where it is needed.
+pub(crate) fn csv(rows: &[Vec<String>]) -> String {
+    let cell = |cell: &String| match cell.contains([',', '"', '\n']) {
+        true => format!("\"{}\"", cell.replace('"', "\"\"")),
+        false => cell.clone(),
+    };
+    rows.iter().map(|row| row.iter().map(cell).collect::<Vec<_>>().join(",") + "\n").collect()
+}

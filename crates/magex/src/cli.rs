@@ -1,6 +1,6 @@
 //! The command line: commands and exit codes.
 
-use crate::commands::{assign, bench, eval, health, replay, roles, train, train_commander, verify};
+use crate::commands::{assign, bench, compare, eval, health, replay, reproduce, roles, train, train_commander, verify};
 use crate::failure;
 use crate::options::CommonOptions;
 use crate::output::note;
@@ -43,6 +43,8 @@ enum Command {
     TrainCommander(train_commander::TrainCommanderArgs),
     Eval(eval::EvalArgs),
     Replay(replay::ReplayArgs),
+    Compare(compare::CompareArgs),
+    Reproduce(reproduce::ReproduceArgs),
     Assign(assign::AssignArgs),
     Bench(bench::BenchArgs),
     Verify(verify::VerifyArgs),
@@ -80,6 +82,8 @@ pub fn main() -> ExitCode {
         Command::TrainCommander(args) => train_commander::run(args, &options),
         Command::Eval(args) => eval::run(args, &options),
         Command::Replay(args) => replay::run(args, &options),
+        Command::Compare(args) => compare::run(args, &options),
+        Command::Reproduce(args) => reproduce::run(args, &options),
         Command::Assign(args) => assign::run(args, &options),
         Command::Bench(args) => Ok(bench::run(args, &options)),
         Command::Verify(args) => verify::run(args, &options),

@@ -2,9 +2,11 @@
 
 pub(crate) mod assign;
 pub(crate) mod bench;
+pub(crate) mod compare;
 pub(crate) mod eval;
 pub(crate) mod health;
 pub(crate) mod replay;
+pub(crate) mod reproduce;
 pub(crate) mod roles;
 pub(crate) mod train;
 pub(crate) mod train_commander;

@@ -20,7 +20,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// Evaluation set of `magex eval` unless another is named.
-const EVAL_SET: u32 = 100;
+pub(crate) const EVAL_SET: u32 = 100;
 /// Limit of agents per shard, unless a single episode has more: bounds the memory of a rollout.
 const AGENTS_PER_SHARD: usize = 800;
 const EPISODES_PER_SHARD: u32 = 16;

@@ -31,8 +31,12 @@ pub const WEIGHTS: &str = "weights.safetensors";
 
 /// `<task>-<N>-<executor>-s<seed>`
 pub(crate) fn default_name(config: &RunConfig) -> String {
-    let (task, executor) = (&config.task, config.executor.kind);
-    format!("{}-{}-{executor}-s{}", task.name, task.agents, config.run.seed)
+    format!("{}-s{}", group_name(config), config.run.seed)
+}
+
+/// `<task>-<N>-<executor>`
+pub(crate) fn group_name(config: &RunConfig) -> String {
+    format!("{}-{}-{}", config.task.name, config.task.agents, config.executor.kind)
 }
 
 /// The folder of all runs, unless an option says otherwise.
@@ -88,12 +92,29 @@ pub fn config_of(folder: &Path) -> anyhow::Result<RunConfig> {
     let path = folder.join(CONFIG);
     let text = std::fs::read_to_string(&path).map_err(|error| match error.kind() {
         std::io::ErrorKind::NotFound => {
-            usage(format!("{} is not a run folder: there is no {CONFIG} in it", folder.display()))
+            let seeds = seeds_in(folder);
+            let hint = seeds.first().map(|first| format!("; it holds one run per seed, such as {}", first.display()));
+            let hint = hint.unwrap_or_default();
+            usage(format!("{} is not a run folder: there is no {CONFIG} in it{hint}", folder.display()))
         }
         _ => usage(format!("{}: {error}", path.display())),
     })?;
     checkpoint::check_format(folder).map_err(usage)?;
     RunConfig::from_toml(&text).with_context(|| path.display().to_string())
+}
+
+/// The folder of a seed's run within that of several seeds.
+pub(crate) fn of_seed(folder: &Path, seed: u64) -> PathBuf {
+    folder.join(format!("seed-{seed}"))
+}
+
+/// The run folders of several seeds in a folder, by seed.
+pub(crate) fn seeds_in(folder: &Path) -> Vec<PathBuf> {
+    let names =
+        std::fs::read_dir(folder).into_iter().flatten().filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let mut seeds: Vec<u64> = names.filter_map(|name| name.strip_prefix("seed-")?.parse().ok()).collect();
+    seeds.sort_unstable();
+    seeds.into_iter().map(|seed| of_seed(folder, seed)).filter(|run| run.join(CONFIG).is_file()).collect()
 }
 
 /// A run with its latest weights.

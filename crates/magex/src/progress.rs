@@ -67,6 +67,8 @@ impl Shares {
 pub(crate) struct Progress {
     /// On a terminal.
     live: Option<LiveLine>,
+    /// Whether iterations have neither rows nor log lines.
+    quiet: bool,
     /// Rows since the last heading, and the columns that it has.
     rows: u32,
     columns: Vec<Column>,
@@ -87,6 +89,7 @@ impl Progress {
         let shown = |row: &usize| METRICS[*row].progress && METRICS[*row].applies(&config.task);
         let mut progress = Self {
             live: None,
+            quiet: false,
             rows: 0,
             columns: Vec::new(),
             target,
@@ -122,6 +125,23 @@ impl Progress {
         progress
     }
 
+    /// For one of many runs: only the status line, and only on a terminal.
+    pub(crate) fn live_line(config: &RunConfig) -> Self {
+        let terminal = std::io::stderr().is_terminal() && !telemetry::is_json();
+        Self {
+            live: terminal.then(|| LiveLine::start(config.run.max_steps, config.steps_per_iteration())),
+            quiet: true,
+            rows: 0,
+            columns: Vec::new(),
+            target: 0.0,
+            metrics: Vec::new(),
+            horizon: config.task.horizon,
+            colours: false,
+            last_iteration: None,
+            page: None,
+        }
+    }
+
     /// The status line, if there is a terminal, for what reports shards within an iteration.
     pub(crate) fn live(&self) -> Option<LiveLine> {
         self.live.clone()
@@ -132,7 +152,9 @@ impl Progress {
             RunEvent::Iteration(report) => match serde_json::from_str::<Row>(&report.metrics_json) {
                 Ok(row) => {
                     self.last_iteration = Some(Instant::now());
-                    self.row(&row);
+                    if !self.quiet {
+                        self.row(&row);
+                    }
                     if let Some(live) = &self.live {
                         let over = row.executor.is_none();
                         live.iteration(report.iterations_completed, report.joint_env_steps_trained, over);

@@ -1,16 +1,22 @@
-//! The effective configuration of a run: defaults, then the file, then the options of the command.
+//! The effective configuration of a run: defaults, then the file, then the settings of single keys, then the options of the
+//! command.
 
 use anyhow::Context as _;
-use magex_core::config::{COLLISIONS_ANY, ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX};
+use magex_core::config::{COLLISIONS_ANY, ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX, Setting};
 use magex_core::task::{AGENTS_MAX, Spawn};
 use magex_runtime::options;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Options that change single keys of the configuration.
 #[derive(Debug, Clone, Default, PartialEq, clap::Args)]
 #[command(next_help_heading = "Configuration (overrides the file)")]
 pub(crate) struct Overrides {
+    /// Any key of the configuration, by its full name: mappo.gamma=0.9; repeat for more. The options below win over it.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) settings: Vec<Setting>,
     /// Seed of every random stream [run.seed].
     #[arg(long, value_name = "S", value_parser = options::whole::<u64>(0, SEED_MAX))]
     pub(crate) seed: Option<u64>,
@@ -41,7 +47,25 @@ pub(crate) struct Overrides {
 }
 
 impl Overrides {
-    /// The configuration with these changes, checked.
+    /// The configuration of a file, or the default one, with the settings of single keys.
+    pub(crate) fn read(&self, path: Option<&Path>) -> anyhow::Result<RunConfig> {
+        let text = path.map_or_else(|| Ok(String::new()), |path| options::text_file("", path))?;
+        let file = || path.map_or_else(String::new, |path| path.display().to_string());
+        RunConfig::from_toml_with(&text, &self.settings).map_err(|error| {
+            // A file that is refused without them is at fault itself.
+            match RunConfig::from_toml(&text) {
+                Ok(_) => anyhow::Error::new(error).context(SET),
+                Err(error) => anyhow::Error::new(error).context(file()),
+            }
+        })
+    }
+
+    /// The configuration of a run with the settings of single keys.
+    pub(crate) fn set(&self, config: RunConfig) -> anyhow::Result<RunConfig> {
+        config.with(&self.settings).context(SET)
+    }
+
+    /// The configuration with the options, checked.
     pub(crate) fn apply(&self, mut config: RunConfig) -> Result<RunConfig, ConfigError> {
         let run = &mut config.run;
         run.seed = self.seed.unwrap_or(run.seed);
@@ -52,17 +76,15 @@ impl Overrides {
         run.target_collisions = self.target_collisions.unwrap_or(run.target_collisions);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
         if let Some(agents) = self.agents {
-            // Keys that were derived from the team size are derived again; keys that were set stay.
-            let derived = config.collect.episodes_per_iteration == config.derived_episodes();
-            config.task = config.task.resized(agents);
-            if derived {
-                config.collect.episodes_per_iteration = config.derived_episodes();
-            }
+            config = config.resized(agents);
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.validated()
     }
 }
+
+/// The option that sets single keys.
+const SET: &str = "--set";
 
 /// Reads a configuration file; without one, the defaults.
 pub fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
@@ -73,6 +95,48 @@ pub fn read(path: Option<&Path>) -> anyhow::Result<RunConfig> {
 pub(crate) fn read_from(option: &str, path: &Path) -> anyhow::Result<RunConfig> {
     let text = options::text_file(option, path)?;
     RunConfig::from_toml(&text).with_context(|| format!("{option} {}", path.display()).trim_start().to_owned())
+}
+
+/// A configuration as JSON, by its text: single-precision numbers print as they are written.
+pub(crate) fn as_json(config: &RunConfig) -> anyhow::Result<Value> {
+    Ok(serde_json::from_str(&serde_json::to_string(config)?)?)
+}
+
+/// Every key of a configuration with its value, as they are written.
+pub(crate) fn flat(config: &RunConfig) -> anyhow::Result<BTreeMap<String, String>> {
+    Ok(flat_value(&as_json(config)?))
+}
+
+/// [`flat`] of [`as_json`].
+pub(crate) fn flat_value(config: &Value) -> BTreeMap<String, String> {
+    fn leaves(path: &str, value: &Value, found: &mut BTreeMap<String, String>) {
+        match value {
+            Value::Object(section) => {
+                let below = |key: &str| if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") };
+                section.iter().for_each(|(key, value)| leaves(&below(key), value, found));
+            }
+            Value::String(text) => drop(found.insert(path.to_owned(), text.clone())),
+            other => drop(found.insert(path.to_owned(), other.to_string())),
+        }
+    }
+    let mut found = BTreeMap::new();
+    leaves("", config, &mut found);
+    found
+}
+
+/// `run.seed is 1, not 2` for every key that differs.
+pub(crate) fn changes(own: &BTreeMap<String, String>, asked: &BTreeMap<String, String>) -> Vec<String> {
+    let value = |of: &BTreeMap<String, String>, key: &String| of.get(key).cloned().unwrap_or_else(|| "not set".into());
+    let keys = differing([own, asked]).into_iter();
+    keys.map(|key| format!("{key} is {}, not {}", value(own, &key), value(asked, &key))).collect()
+}
+
+/// The keys whose values are not the same everywhere.
+pub(crate) fn differing<'a>(all: impl IntoIterator<Item = &'a BTreeMap<String, String>>) -> Vec<String> {
+    let all: Vec<_> = all.into_iter().collect();
+    let keys: BTreeSet<&String> = all.iter().flat_map(|one| one.keys()).collect();
+    let same = |key: &&String| all.windows(2).all(|pair| pair[0].get(*key) == pair[1].get(*key));
+    keys.into_iter().filter(|key| !same(key)).cloned().collect()
 }
 
 /// Parses a name of the configuration, such as an executor.

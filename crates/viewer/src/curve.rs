@@ -1,6 +1,7 @@
 //! The curves of a run as an SVG picture, over joint steps. It has a dark mode: one style block holds every colour.
 
 mod axis;
+pub mod systems;
 
 use crate::plots::{self, LOG_FROM, Plot};
 use axis::{Axis, labels, limits, short_count, ticks};
@@ -146,35 +147,39 @@ pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<S
     let mut head = Svg { body: String::new(), last };
     head.text([MARGIN, 34.0], "start", "ink name", title);
     head.text([MARGIN, 54.0], "start", "soft", subtitle);
+    let looks = Kind::ALL.map(Kind::look).map(|look| (look.class, look.light, look.dark));
     Ok(format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{WIDTH}\" height=\"{height}\" viewBox=\"0 0 {WIDTH} {height}\" \
          role=\"img\">\n<title>Learning curves of {}</title>\n<style>\n{}</style>\n\
          <rect class=\"page\" width=\"100%\" height=\"100%\"/>\n{}{}</svg>\n",
         escape(title),
-        style(),
+        style(frame().into_iter().chain(looks).collect(), ""),
         head.body,
         svg.body
     ))
 }
 
-/// Every colour of the picture, light and dark, as the property `color` of classes; shapes take theirs from it.
-fn style() -> String {
-    let frame = [
-        ("page", "#ffffff", "#191d26"),
-        ("ink", "#1b1f27", "#e8ebf1"),
-        ("soft", "#5d6879", "#9aa4b6"),
-        ("grid", "#e4e7ec", "#2c3341"),
-    ];
-    let looks = Kind::ALL.map(Kind::look).map(|look| (look.class, look.light, look.dark));
-    let colours = || frame.into_iter().chain(looks);
-    let light: String = colours().map(|(class, light, _)| format!(".{class}{{color:{light}}}")).collect();
-    let dark: String = colours().map(|(class, _, dark)| format!(".{class}{{color:{dark}}}")).collect();
+/// Every colour of the picture, light and dark, as the property `color` of classes; shapes take theirs from it. `more` are rules
+/// without colours.
+fn style(colours: Vec<(&str, &str, &str)>, more: &str) -> String {
+    let light: String = colours.iter().map(|(class, light, _)| format!(".{class}{{color:{light}}}")).collect();
+    let dark: String = colours.iter().map(|(class, _, dark)| format!(".{class}{{color:{dark}}}")).collect();
     format!(
         "svg{{font:13px Inter,'Segoe UI',Roboto,'DejaVu Sans',sans-serif}}\
          rect,text,tspan,circle{{fill:currentColor}}line,polyline{{stroke:currentColor;fill:none;stroke-linejoin:round}}\
          .name{{font-size:22px;font-weight:600}}.title{{font-size:14px}}.label{{font-size:12px}}\n\
-         {light}\n@media (prefers-color-scheme: dark){{{dark}}}\n"
+         {more}{light}\n@media (prefers-color-scheme: dark){{{dark}}}\n"
     )
+}
+
+/// Colours of what is around the curves.
+fn frame() -> [(&'static str, &'static str, &'static str); 4] {
+    [
+        ("page", "#ffffff", "#191d26"),
+        ("ink", "#1b1f27", "#e8ebf1"),
+        ("soft", "#5d6879", "#9aa4b6"),
+        ("grid", "#e4e7ec", "#2c3341"),
+    ]
 }
 
 struct Svg {

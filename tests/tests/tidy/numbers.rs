@@ -5,7 +5,7 @@ use crate::workspace::{metadata, product_files, root};
 use std::path::Path;
 
 /// Crates in which every line may decide a number.
-const CRATES: [&str; 4] = ["magex-core", "magex-env", "magex-assign", "magex-nets"];
+const CRATES: [&str; 5] = ["magex-core", "magex-env", "magex-assign", "magex-nets", "magex-stats"];
 /// The part of the learner that does.
 const FOLDERS: [&str; 1] = ["learner/src/train"];
 /// Clocks, and collections whose order is another in every process.

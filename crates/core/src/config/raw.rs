@@ -2,6 +2,7 @@
 
 use super::{
     CollectConfig, CommanderConfig, ConfigError, EPISODES_MAX, ExecutorConfig, MappoConfig, RunConfig, RunSection,
+    Setting,
 };
 use crate::error::FieldError;
 use crate::task::{self, NOT_ZERO};
@@ -54,11 +55,13 @@ fn collect_bounds(_key: &str) -> Option<String> {
     Some(format!("1 to {EPISODES_MAX}"))
 }
 
-/// The configuration of a file; missing values are defaults or derived from others. Ranges are not checked.
-pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
+/// The configuration of a file with some keys changed; missing values are defaults or derived from others. Ranges are not
+/// checked.
+pub(super) fn read(text: &str, settings: &[Setting]) -> Result<RunConfig, ConfigError> {
     let file: Table = toml::from_str(text).map_err(|error| not_toml(text, &error))?;
+    let mut file = if file.contains_key("task") { file } else { on_the_first_run(file)? };
+    settings.iter().try_for_each(|setting| setting.apply(&mut file))?;
     refuse_renamed(&file)?;
-    let file = if file.contains_key("task") { file } else { on_the_first_run(file)? };
     let sections: Sections = toml_table::read("", file, |_| None)?;
     let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
     let collect: RawCollect = toml_table::read("collect", sections.collect, collect_bounds)?;
@@ -82,9 +85,12 @@ pub(super) fn read(text: &str) -> Result<RunConfig, ConfigError> {
 fn on_the_first_run(file: Table) -> Result<Table, ConfigError> {
     let text = RunConfig::default().to_toml()?;
     let mut base: Table = toml::from_str(&text).map_err(|error| ConfigError(error.to_string()))?;
-    // Derived, also from what the file says.
+    // Derived, also from what the file and the settings say.
     if let Some(Value::Table(collect)) = base.get_mut("collect") {
         collect.remove("episodes_per_iteration");
+    }
+    if let Some(Value::Table(task)) = base.get_mut("task") {
+        task.retain(|key, _| ["name", "agents", "spawn"].contains(&key));
     }
     for (name, section) in file {
         match (base.get_mut(&name), section) {

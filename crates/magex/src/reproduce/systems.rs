@@ -1,0 +1,205 @@
+//! The paper's tables: which systems on which tasks, and what the paper reports.
+//!
+//! A system is one entry. A learner has a configuration for every task of its table and may set further keys; a controller has a
+//! name. The values of the paper stand in the order of the tasks.
+
+use crate::evaluate::Controller;
+
+/// A table of the paper.
+#[derive(Debug, PartialEq)]
+pub(crate) struct PaperTable {
+    /// Name on the command line and of folders.
+    pub(crate) name: &'static str,
+    pub(crate) title: &'static str,
+    /// Where the paper has it.
+    pub(crate) source: &'static str,
+    /// By team size.
+    pub(crate) tasks: &'static [Task],
+    /// The first one is MAGE-X: the others are compared with it.
+    pub(crate) systems: &'static [System],
+}
+
+/// A column of a table.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Task {
+    /// N.
+    pub(crate) agents: usize,
+    /// The configuration that controllers are evaluated with.
+    pub(crate) config: &'static str,
+}
+
+/// A row of a table.
+#[derive(Debug, PartialEq)]
+pub(crate) struct System {
+    /// As the paper calls it.
+    pub(crate) name: &'static str,
+    /// Name on the command line and of folders: lower case, no comma.
+    pub(crate) id: &'static str,
+    pub(crate) by: By,
+    /// For every task; empty if the paper does not have the system.
+    pub(crate) paper: &'static [Paper],
+}
+
+/// What chooses the actions.
+#[derive(Debug, PartialEq)]
+pub(crate) enum By {
+    /// It is trained.
+    Learner {
+        /// A configuration for every task, or one for all of them: name, team size and starts are those of the task.
+        configs: &'static [&'static str],
+        /// Keys that differ from them, as for `magex train --set`.
+        set: &'static [&'static str],
+    },
+    /// Nothing is trained; goals come from the exact scheduler.
+    Controller(Controller),
+}
+
+/// Mean and standard deviation in the paper.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Paper {
+    pub(crate) success: [f64; 2],
+    /// Of drones only.
+    pub(crate) collisions: Option<[f64; 2]>,
+}
+
+const fn success(mean: f64, deviation: f64) -> Paper {
+    Paper { success: [mean, deviation], collisions: None }
+}
+
+const fn drones(success: [f64; 2], collisions: [f64; 2]) -> Paper {
+    Paper { success, collisions: Some(collisions) }
+}
+
+const SPREAD_5: &str = include_str!("../../../../deploy/configs/spread-5.toml");
+const SPREAD_20: &str = include_str!("../../../../deploy/configs/spread-20.toml");
+const SPREAD_50: &str = include_str!("../../../../deploy/configs/spread-50.toml");
+const PUSH_BALL_5: &str = include_str!("../../../../deploy/configs/push-ball-5.toml");
+const PUSH_BALL_20: &str = include_str!("../../../../deploy/configs/push-ball-20.toml");
+const DRONES_2: &str = include_str!("../../../../deploy/configs/drones-2.toml");
+const DRONES_4: &str = include_str!("../../../../deploy/configs/drones-4.toml");
+const MAPPO: &str = include_str!("../../../../deploy/configs/baselines/mappo.toml");
+
+const SPREAD: &[Task] = &[
+    Task { agents: 5, config: SPREAD_5 },
+    Task { agents: 20, config: SPREAD_20 },
+    Task { agents: 50, config: SPREAD_50 },
+];
+/// MAGE-X on the paper's three sizes of Simple Spread.
+const MAGE_X_SPREAD: System = learner(
+    "MAGE-X",
+    "mage-x",
+    &[SPREAD_5, SPREAD_20, SPREAD_50],
+    &[],
+    &[success(1.00, 0.01), success(1.00, 0.01), success(1.00, 0.01)],
+);
+
+/// Every table, in the order of the paper.
+#[rustfmt::skip]
+pub(crate) const TABLES: &[PaperTable] = &[
+    PaperTable {
+        name: "spread",
+        title: "Simple Spread",
+        source: "main results, Simple Spread",
+        tasks: SPREAD,
+        systems: &[
+            MAGE_X_SPREAD,
+            learner("MAPPO", "mappo", &[MAPPO], &[], &[success(0.82, 0.03), success(0.50, 0.31), success(0.13, 0.02)]),
+        ],
+    },
+    PaperTable {
+        name: "push-ball",
+        title: "Push Ball",
+        source: "main results, Push Ball",
+        tasks: &[Task { agents: 5, config: PUSH_BALL_5 }, Task { agents: 20, config: PUSH_BALL_20 }],
+        systems: &[
+            learner("MAGE-X", "mage-x", &[PUSH_BALL_5, PUSH_BALL_20], &[], &[success(1.00, 0.01), success(1.00, 0.01)]),
+            learner("MAPPO", "mappo", &[MAPPO], &[], &[success(0.20, 0.01), success(0.26, 0.01)]),
+        ],
+    },
+    PaperTable {
+        name: "drones",
+        title: "Drones",
+        source: "main results, Drones",
+        tasks: &[Task { agents: 2, config: DRONES_2 }, Task { agents: 4, config: DRONES_4 }],
+        systems: &[
+            learner("MAGE-X", "mage-x", &[DRONES_2, DRONES_4], &[], &[drones([0.95, 0.03], [0.02, 0.01]), drones([0.79, 0.07], [0.12, 0.01])]),
+            learner("MAPPO", "mappo", &[MAPPO], &[], &[drones([0.83, 0.03], [0.10, 0.01]), drones([0.64, 0.01], [0.18, 0.02])]),
+        ],
+    },
+    PaperTable {
+        name: "ablation",
+        title: "Ablation in Simple Spread",
+        source: "ablation study",
+        tasks: &[Task { agents: 50, config: SPREAD_50 }],
+        systems: &[
+            learner("MAGE-X", "mage-x", &[SPREAD_50], &[], &[success(1.00, 0.01)]),
+            learner("MAGE-X w. RG", "mage-x-rg", &[SPREAD_50], &["commander.kind=random"], &[success(0.83, 0.01)]),
+            learner("MAGE-X-Atten", "mage-x-atten", &[SPREAD_50], &["executor.kind=attention"], &[success(0.93, 0.01)]),
+            learner("MAGE-X-MLP", "mage-x-mlp", &[SPREAD_50], &["executor.kind=mlp"], &[success(0.50, 0.08)]),
+        ],
+    },
+    PaperTable {
+        name: "planner",
+        title: "Planners in Simple Spread",
+        source: "appendix, comparison with MA A*",
+        tasks: SPREAD,
+        systems: &[
+            MAGE_X_SPREAD,
+            controller("scripted", "scripted", Controller::Scripted, &[]),
+        ],
+    },
+];
+
+const fn learner(
+    name: &'static str,
+    id: &'static str,
+    configs: &'static [&'static str],
+    set: &'static [&'static str],
+    paper: &'static [Paper],
+) -> System {
+    System { name, id, by: By::Learner { configs, set }, paper }
+}
+
+const fn controller(name: &'static str, id: &'static str, by: Controller, paper: &'static [Paper]) -> System {
+    System { name, id, by: By::Controller(by), paper }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use magex_core::config::{RunConfig, Setting};
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn every_entry_is_complete_and_can_be_trained() {
+        let mut names = BTreeSet::new();
+        for table in TABLES {
+            assert!(names.insert(table.name) && table.systems[0].id == "mage-x", "{}", table.name);
+            let ids: BTreeSet<&str> = table.systems.iter().map(|system| system.id).collect();
+            assert_eq!(ids.len(), table.systems.len(), "{}", table.name);
+            for system in table.systems {
+                let place = format!("{}, {}", table.name, system.name);
+                let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+                assert!(system.id.chars().all(plain), "{place}");
+                assert!([0, table.tasks.len()].contains(&system.paper.len()), "{place}: the paper's values");
+                let By::Learner { configs, set } = &system.by else { continue };
+                assert!([1, table.tasks.len()].contains(&configs.len()), "{place}");
+                let settings: Vec<Setting> = set.iter().map(|text| text.parse().unwrap()).collect();
+                for (k, task) in table.tasks.iter().enumerate() {
+                    let config = RunConfig::from_toml_with(configs.get(k).unwrap_or(&configs[0]), &settings).unwrap();
+                    let own = RunConfig::from_toml(task.config).unwrap();
+                    assert_eq!(own.task.agents, task.agents, "{place}");
+                    assert!(configs.len() == 1 || config.task.agents == task.agents, "{place}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn shares_are_shares() {
+        for paper in TABLES.iter().flat_map(|table| table.systems).flat_map(|system| system.paper) {
+            let values = paper.success.into_iter().chain(paper.collisions.into_iter().flatten());
+            assert!(values.into_iter().all(|value| (0.0..=1.0).contains(&value)), "{paper:?}");
+        }
+    }
+}
