@@ -78,6 +78,9 @@ const PUSH_BALL_20: &str = include_str!("../../../../deploy/configs/push-ball-20
 const DRONES_2: &str = include_str!("../../../../deploy/configs/drones-2.toml");
 const DRONES_4: &str = include_str!("../../../../deploy/configs/drones-4.toml");
 const MAPPO: &str = include_str!("../../../../deploy/configs/baselines/mappo.toml");
+const IPPO: &str = include_str!("../../../../deploy/configs/baselines/ippo.toml");
+const MAT: &str = include_str!("../../../../deploy/configs/baselines/mat.toml");
+const DICG: &str = include_str!("../../../../deploy/configs/baselines/dicg.toml");
 
 const SPREAD: &[Task] = &[
     Task { agents: 5, config: SPREAD_5 },
@@ -104,6 +107,9 @@ pub(crate) const TABLES: &[PaperTable] = &[
         systems: &[
             MAGE_X_SPREAD,
             learner("MAPPO", "mappo", &[MAPPO], &[], &[success(0.82, 0.03), success(0.50, 0.31), success(0.13, 0.02)]),
+            learner("IPPO", "ippo", &[IPPO], &[], &[]),
+            learner("MAT", "mat", &[MAT], &[], &[success(1.00, 0.01), success(0.56, 0.26), success(0.11, 0.01)]),
+            learner("DICG", "dicg", &[DICG], &[], &[success(0.71, 0.05), success(0.41, 0.04), success(0.12, 0.02)]),
         ],
     },
     PaperTable {
@@ -113,7 +119,6 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: &[Task { agents: 5, config: PUSH_BALL_5 }, Task { agents: 20, config: PUSH_BALL_20 }],
         systems: &[
             learner("MAGE-X", "mage-x", &[PUSH_BALL_5, PUSH_BALL_20], &[], &[success(1.00, 0.01), success(1.00, 0.01)]),
-            learner("MAPPO", "mappo", &[MAPPO], &[], &[success(0.20, 0.01), success(0.26, 0.01)]),
         ],
     },
     PaperTable {
@@ -123,7 +128,6 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: &[Task { agents: 2, config: DRONES_2 }, Task { agents: 4, config: DRONES_4 }],
         systems: &[
             learner("MAGE-X", "mage-x", &[DRONES_2, DRONES_4], &[], &[drones([0.95, 0.03], [0.02, 0.01]), drones([0.79, 0.07], [0.12, 0.01])]),
-            learner("MAPPO", "mappo", &[MAPPO], &[], &[drones([0.83, 0.03], [0.10, 0.01]), drones([0.64, 0.01], [0.18, 0.02])]),
         ],
     },
     PaperTable {
