@@ -1,6 +1,6 @@
 //! How long cells are trained and how often they are evaluated.
 
-use super::systems::{By, PaperTable, System};
+use super::systems::{By, LARGE, PaperTable, System};
 use anyhow::Context as _;
 use magex_core::config::{RunConfig, Setting};
 
@@ -92,9 +92,13 @@ impl Budget {
         let mut cells = Vec::new();
         for task in tasks {
             for system in table.systems {
-                let (text, set) = match &system.by {
-                    By::Learner { configs, set } => (*configs.get(task).unwrap_or(&configs[0]), *set),
-                    By::Controller(_) => (table.tasks[task].config, &[] as &[&str]),
+                let large = table.tasks[task].agents >= LARGE;
+                let (text, set): (&str, Vec<&str>) = match &system.by {
+                    By::Learner { configs, set, set_large } => {
+                        let more = if large { set_large } else { &[] as &[&str] };
+                        (configs.get(task).unwrap_or(&configs[0]), [set, more].concat())
+                    }
+                    By::Controller(..) => (table.tasks[task].config, Vec::new()),
                 };
                 let own = RunConfig::from_toml(table.tasks[task].config)?.task;
                 let task_keys =

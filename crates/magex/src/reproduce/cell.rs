@@ -3,7 +3,7 @@
 use super::budget::Cell;
 use super::record::{EndedBy, Evaluated, FORMAT, Record, curve_of};
 use super::systems::By;
-use crate::evaluate::{Controller, EVAL_SET, Episodes, Variation, roll_out};
+use crate::evaluate::{EVAL_SET, Episodes, Variation, roll_out};
 use crate::failure::usage;
 use crate::folder;
 use crate::progress::Progress;
@@ -11,7 +11,7 @@ use crate::runs::SeedRun;
 use crate::settings;
 use crate::supervise::TrainEnd;
 use crate::training::{Means, Plan};
-use magex_core::config::{CommanderPolicy, RunConfig};
+use magex_core::config::RunConfig;
 use magex_core::ids::Mode;
 use magex_learner::run_folder::RunFolderState;
 use std::path::{Path, PathBuf};
@@ -82,12 +82,14 @@ pub(crate) fn measure(place: &Place<'_>, cell: &Cell, seed: u64) -> anyhow::Resu
         eval_set: EVAL_SET,
         greedy: Evaluated::default(),
         sampled: Evaluated::default(),
+        planning_ms: None,
         curve: Vec::new(),
     };
     match &cell.system.by {
-        By::Controller(controller) => {
-            let vary = by_controller(*controller);
-            (record.greedy, record.sampled) = evaluate(place, &config, &vary, &[])?;
+        By::Controller(controller, scheduler) => {
+            let (controller, scheduler) = (*controller, Some(*scheduler));
+            let vary = Variation { controller, scheduler, ..Variation::default() };
+            (record.greedy, record.sampled, record.planning_ms) = evaluate(place, &config, &vary, &[])?;
         }
         By::Learner { .. } => {
             let folder = run_folder(place.out, cell, seed);
@@ -105,15 +107,10 @@ pub(crate) fn measure(place: &Place<'_>, cell: &Cell, seed: u64) -> anyhow::Resu
             record.converged = if record.ended_by == EndedBy::Target { Some(true) } else { flat };
             (record.joint_env_steps, record.wall_s, record.curve) = (run.steps(), run.wall_s(), curve);
             record.weights_sha256 = Some(trained.sha256);
-            (record.greedy, record.sampled) = evaluate(place, &config, &Variation::default(), &trained.weights)?;
+            (record.greedy, record.sampled, _) = evaluate(place, &config, &Variation::default(), &trained.weights)?;
         }
     }
     Ok((!place.interrupted.is_cancelled()).then_some(record))
-}
-
-/// A controller with the goals of the exact scheduler.
-fn by_controller(controller: Controller) -> Variation {
-    Variation { controller, scheduler: Some(CommanderPolicy::Exact), ..Variation::default() }
 }
 
 /// Trains in this process until the run is complete, its wall time is spent or the command is interrupted.
@@ -138,16 +135,18 @@ fn train(place: &Place<'_>, cell: &Cell, config: &RunConfig, folder: &Path) -> a
     end
 }
 
+/// Greedy and sampled, and the milliseconds per episode that a controller without weights computed.
 fn evaluate(
     place: &Place<'_>,
     config: &RunConfig,
     vary: &Variation,
     weights: &[u8],
-) -> anyhow::Result<(Evaluated, Evaluated)> {
-    let policy = vary.policy(config, weights)?;
+) -> anyhow::Result<(Evaluated, Evaluated, Option<f64>)> {
+    let (policy, planning) = vary.policy(config, weights)?;
     let of = |mode: Mode| {
         let episodes = Episodes { count: place.episodes, set: EVAL_SET, mode, record: 0 };
         anyhow::Ok(Evaluated::of(&roll_out(&policy, config, episodes, place.threads)?.0))
     };
-    Ok((of(Mode::Greedy)?, of(Mode::Sampled)?))
+    let (greedy, sampled) = (of(Mode::Greedy)?, of(Mode::Sampled)?);
+    Ok((greedy, sampled, planning.map(|clock| clock.take_ms() / f64::from(2 * place.episodes))))
 }

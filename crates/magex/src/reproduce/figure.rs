@@ -27,7 +27,7 @@ fn panel(measured: &[Measured], agents: usize) -> Panel {
     let curve = |one: &&Measured| {
         let level = one.greedy().map_or(0.0, |value| value.mean);
         let points = match one.cell.system.by {
-            By::Controller(_) => [0.0, longest].map(|steps| band(steps, [level; 3])).to_vec(),
+            By::Controller(..) => [0.0, longest].map(|steps| band(steps, [level; 3])).to_vec(),
             By::Learner { .. } => {
                 let runs: Vec<_> = one.records.iter().map(Record::success_curve).collect();
                 curves::band(&runs).iter().map(|p| band(p.x, [p.mean, p.low, p.high])).collect()

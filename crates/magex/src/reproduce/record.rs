@@ -5,7 +5,9 @@ use crate::artifacts;
 use crate::runs::SeedRun;
 use crate::settings;
 use anyhow::Context as _;
-use magex_core::metrics_table::{COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, METRICS, SUCCESS_RATE, as_written};
+use magex_core::metrics_table::{
+    ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, METRICS, SUCCESS_RATE, as_written,
+};
 use magex_core::trajectory::EpisodeMetrics;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -41,6 +43,8 @@ pub(crate) struct Record {
     pub(crate) eval_set: u32,
     pub(crate) greedy: Evaluated,
     pub(crate) sampled: Evaluated,
+    /// Wall time per episode in a controller without weights; null for a learner.
+    pub(crate) planning_ms: Option<f64>,
     pub(crate) curve: Vec<CurvePoint>,
 }
 
@@ -74,6 +78,8 @@ impl EndedBy {
 pub(crate) struct Evaluated {
     pub(crate) success_rate: Vec<f64>,
     pub(crate) collisions_per_agent_step: Vec<f64>,
+    /// First step after which (almost) all landmarks were covered; the horizon + 1 if that never happened.
+    pub(crate) arrival_step: Vec<f64>,
     /// Share of crashed agents; 0 in tasks where nothing crashes.
     pub(crate) collision_rate: Vec<f64>,
 }
@@ -84,6 +90,7 @@ impl Evaluated {
         Self {
             success_rate: values(SUCCESS_RATE),
             collisions_per_agent_step: values(COLLISIONS_PER_AGENT_STEP),
+            arrival_step: values(ARRIVAL_STEP),
             collision_rate: values(COLLISION_RATE),
         }
     }
@@ -114,7 +121,8 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Option<Record>> {
     let record: Record = serde_json::from_str(&text).with_context(named)?;
     let episodes = record.greedy.success_rate.len();
     let complete = |e: &Evaluated| {
-        [&e.success_rate, &e.collisions_per_agent_step, &e.collision_rate].iter().all(|v| v.len() == episodes)
+        let all = [&e.success_rate, &e.collisions_per_agent_step, &e.arrival_step, &e.collision_rate];
+        all.iter().all(|v| v.len() == episodes)
     };
     if record.format != FORMAT || episodes == 0 || !complete(&record.greedy) || !complete(&record.sampled) {
         return Err(anyhow::anyhow!("its format is {}, or it has no episodes", record.format).context(named()));

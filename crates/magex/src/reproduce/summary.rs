@@ -55,6 +55,18 @@ impl Measured {
         crash.then(|| OverSeeds::of(rates)).flatten()
     }
 
+    /// First step after which (almost) all landmarks were covered, mean over greedy episodes and seeds; the horizon + 1 counts where
+    /// that never happened.
+    pub(crate) fn arrival(&self) -> f64 {
+        average(&self.records.iter().map(|record| average(&record.greedy.arrival_step)).collect::<Vec<_>>())
+    }
+
+    /// Milliseconds per episode in a controller without weights.
+    pub(crate) fn planning_ms(&self) -> Option<f64> {
+        let of_seeds: Option<Vec<f64>> = self.records.iter().map(|record| record.planning_ms).collect();
+        of_seeds.map(|of_seeds| average(&of_seeds))
+    }
+
     /// The greedy success of every seed.
     fn scores(&self) -> Vec<f64> {
         self.records.iter().map(|record| average(&record.greedy.success_rate)).collect()

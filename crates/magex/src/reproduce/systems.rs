@@ -4,6 +4,7 @@
 //! name. The values of the paper stand in the order of the tasks.
 
 use crate::evaluate::Controller;
+use magex_core::config::CommanderPolicy;
 
 /// A table of the paper.
 #[derive(Debug, PartialEq)]
@@ -49,10 +50,15 @@ pub(crate) enum By {
         configs: &'static [&'static str],
         /// Keys that differ from them, as for `magex train --set`.
         set: &'static [&'static str],
+        /// The same for teams of [`LARGE`] agents and more.
+        set_large: &'static [&'static str],
     },
-    /// Nothing is trained; goals come from the exact scheduler.
-    Controller(Controller),
+    /// Nothing is trained; goals come from a scheduler without weights.
+    Controller(Controller, CommanderPolicy),
 }
+
+/// Agents from which a team is large.
+pub(crate) const LARGE: usize = 20;
 
 /// Mean and standard deviation in the paper.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -78,9 +84,18 @@ const PUSH_BALL_20: &str = include_str!("../../../../deploy/configs/push-ball-20
 const DRONES_2: &str = include_str!("../../../../deploy/configs/drones-2.toml");
 const DRONES_4: &str = include_str!("../../../../deploy/configs/drones-4.toml");
 const MAPPO: &str = include_str!("../../../../deploy/configs/baselines/mappo.toml");
+const MAPPO_RNN: &str = include_str!("../../../../deploy/configs/baselines/mappo-rnn.toml");
 const IPPO: &str = include_str!("../../../../deploy/configs/baselines/ippo.toml");
+const MAPPO_GOALS: &str = include_str!("../../../../deploy/configs/baselines/mappo-goals.toml");
 const MAT: &str = include_str!("../../../../deploy/configs/baselines/mat.toml");
+const MAT_DEC: &str = include_str!("../../../../deploy/configs/baselines/mat-dec.toml");
+const MAT_GOALS: &str = include_str!("../../../../deploy/configs/baselines/mat-goals.toml");
 const DICG: &str = include_str!("../../../../deploy/configs/baselines/dicg.toml");
+const DICG_FROZEN: &str = include_str!("../../../../deploy/configs/baselines/dicg-frozen.toml");
+const DICG_GOALS: &str = include_str!("../../../../deploy/configs/baselines/dicg-goals.toml");
+
+/// A large team's iteration has as many agent samples in fewer episodes, and its minibatches are larger.
+const LARGE_TEAM: &[&str] = &["collect.episodes_per_iteration=16", "mappo.epochs=5", "mappo.minibatch_size=8000"];
 
 const SPREAD: &[Task] = &[
     Task { agents: 5, config: SPREAD_5 },
@@ -96,6 +111,9 @@ const MAGE_X_SPREAD: System = learner(
     &[success(1.00, 0.01), success(1.00, 0.01), success(1.00, 0.01)],
 );
 
+/// The paper does not say how goals are assigned.
+const MA_ASTAR: &[Paper] = &[success(1.00, 0.01), success(0.93, 0.03), success(0.77, 0.03)];
+
 /// Every table, in the order of the paper.
 #[rustfmt::skip]
 pub(crate) const TABLES: &[PaperTable] = &[
@@ -106,10 +124,18 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: SPREAD,
         systems: &[
             MAGE_X_SPREAD,
-            learner("MAPPO", "mappo", &[MAPPO], &[], &[success(0.82, 0.03), success(0.50, 0.31), success(0.13, 0.02)]),
-            learner("IPPO", "ippo", &[IPPO], &[], &[]),
-            learner("MAT", "mat", &[MAT], &[], &[success(1.00, 0.01), success(0.56, 0.26), success(0.11, 0.01)]),
-            learner("DICG", "dicg", &[DICG], &[], &[success(0.71, 0.05), success(0.41, 0.04), success(0.12, 0.02)]),
+            baseline("MAPPO", "mappo", &[MAPPO], &[success(0.82, 0.03), success(0.50, 0.31), success(0.13, 0.02)]),
+            baseline("MAT", "mat", &[MAT], &[success(1.00, 0.01), success(0.56, 0.26), success(0.11, 0.01)]),
+            baseline("DICG", "dicg", &[DICG], &[success(0.71, 0.05), success(0.41, 0.04), success(0.12, 0.02)]),
+            baseline("MAPPO, GRU", "mappo-rnn", &[MAPPO_RNN], &[]),
+            baseline("IPPO", "ippo", &[IPPO], &[]),
+            baseline("MAT-Dec", "mat-dec", &[MAT_DEC], &[]),
+            baseline("DICG, frozen graph", "dicg-frozen", &[DICG_FROZEN], &[]),
+            baseline("MAPPO + goals", "mappo-goals", &[MAPPO_GOALS], &[]),
+            baseline("MAT + goals", "mat-goals", &[MAT_GOALS], &[]),
+            baseline("DICG + goals", "dicg-goals", &[DICG_GOALS], &[]),
+            controller("nearest landmark", "nearest", Controller::Nearest, &[]),
+            controller("random actions", "random", Controller::Random, &[]),
         ],
     },
     PaperTable {
@@ -119,6 +145,12 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: &[Task { agents: 5, config: PUSH_BALL_5 }, Task { agents: 20, config: PUSH_BALL_20 }],
         systems: &[
             learner("MAGE-X", "mage-x", &[PUSH_BALL_5, PUSH_BALL_20], &[], &[success(1.00, 0.01), success(1.00, 0.01)]),
+            baseline("MAPPO", "mappo", &[MAPPO], &[success(0.20, 0.01), success(0.26, 0.01)]),
+            baseline("MAT", "mat", &[MAT], &[success(0.32, 0.04), success(0.25, 0.02)]),
+            baseline("DICG", "dicg", &[DICG], &[success(0.20, 0.01), success(0.36, 0.01)]),
+            controller("scripted", "scripted", Controller::Scripted, &[]),
+            controller("nearest ball", "nearest", Controller::Nearest, &[]),
+            controller("random actions", "random", Controller::Random, &[]),
         ],
     },
     PaperTable {
@@ -128,6 +160,12 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: &[Task { agents: 2, config: DRONES_2 }, Task { agents: 4, config: DRONES_4 }],
         systems: &[
             learner("MAGE-X", "mage-x", &[DRONES_2, DRONES_4], &[], &[drones([0.95, 0.03], [0.02, 0.01]), drones([0.79, 0.07], [0.12, 0.01])]),
+            baseline("MAPPO", "mappo", &[MAPPO], &[drones([0.83, 0.03], [0.10, 0.01]), drones([0.64, 0.01], [0.18, 0.02])]),
+            baseline("MAT", "mat", &[MAT], &[drones([0.61, 0.01], [0.09, 0.01]), drones([0.34, 0.04], [0.06, 0.01])]),
+            baseline("DICG", "dicg", &[DICG], &[drones([0.45, 0.02], [0.03, 0.02]), drones([0.12, 0.01], [0.07, 0.01])]),
+            controller("scripted", "scripted", Controller::Scripted, &[]),
+            controller("nearest landmark", "nearest", Controller::Nearest, &[]),
+            controller("random actions", "random", Controller::Random, &[]),
         ],
     },
     PaperTable {
@@ -149,7 +187,12 @@ pub(crate) const TABLES: &[PaperTable] = &[
         tasks: SPREAD,
         systems: &[
             MAGE_X_SPREAD,
+            planner("MA A*, exact goals", "astar", CommanderPolicy::Exact, MA_ASTAR),
+            planner("MA A*, greedy goals", "astar-greedy", CommanderPolicy::Greedy, MA_ASTAR),
+            planner("MA A*, random goals", "astar-random", CommanderPolicy::Random, MA_ASTAR),
+            controller("ORCA", "orca", Controller::Orca, &[]),
             controller("scripted", "scripted", Controller::Scripted, &[]),
+            controller("nearest landmark", "nearest", Controller::Nearest, &[]),
         ],
     },
 ];
@@ -161,11 +204,27 @@ const fn learner(
     set: &'static [&'static str],
     paper: &'static [Paper],
 ) -> System {
-    System { name, id, by: By::Learner { configs, set }, paper }
+    System { name, id, by: By::Learner { configs, set, set_large: &[] }, paper }
 }
 
+/// A learner of the paper's comparison: one configuration, and other batches for large teams.
+const fn baseline(
+    name: &'static str,
+    id: &'static str,
+    configs: &'static [&'static str],
+    paper: &'static [Paper],
+) -> System {
+    System { name, id, by: By::Learner { configs, set: &[], set_large: LARGE_TEAM }, paper }
+}
+
+/// A controller with the goals of the exact scheduler.
 const fn controller(name: &'static str, id: &'static str, by: Controller, paper: &'static [Paper]) -> System {
-    System { name, id, by: By::Controller(by), paper }
+    System { name, id, by: By::Controller(by, CommanderPolicy::Exact), paper }
+}
+
+/// MA A* with the goals of a scheduler.
+const fn planner(name: &'static str, id: &'static str, goals: CommanderPolicy, paper: &'static [Paper]) -> System {
+    System { name, id, by: By::Controller(Controller::Astar, goals), paper }
 }
 
 #[cfg(test)]
@@ -186,7 +245,7 @@ mod tests {
                 let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
                 assert!(system.id.chars().all(plain), "{place}");
                 assert!([0, table.tasks.len()].contains(&system.paper.len()), "{place}: the paper's values");
-                let By::Learner { configs, set } = &system.by else { continue };
+                let By::Learner { configs, set, .. } = &system.by else { continue };
                 assert!([1, table.tasks.len()].contains(&configs.len()), "{place}");
                 let settings: Vec<Setting> = set.iter().map(|text| text.parse().unwrap()).collect();
                 for (k, task) in table.tasks.iter().enumerate() {

@@ -79,6 +79,9 @@ pub(crate) fn markdown(budget: &Budget, tables: &[(&'static PaperTable, Vec<Meas
         \"Mean (standard deviation)\" is over the means of the seeds, with n − 1; a single seed has none.\n\
         IQM is the interquartile mean; below four numbers it is their mean.\n\
         Brackets: 95 % interval of the stratified percentile bootstrap over the seeds.\n\
+        Arrival: first step after which (almost) all landmarks were covered, mean over the greedy episodes; the horizon + 1 \
+        counts where that never happened.\n\
+        Planning: wall time per episode in a controller without weights.\n\
         Steps: joint environment steps trained on, mean over the seeds; what ended the training stands beside it.\n\
         Converged: seeds that reached the target, or whose mean greedy success of the last quarter of the \
         evaluations differs by less than 0.01 from that of the quarter before; a dash: fewer than 8 evaluations.\n";
@@ -99,7 +102,9 @@ fn cells(text: &mut String, measured: &[Measured]) {
     if crashes {
         names.extend(["collisions", "paper, collisions"]);
     }
-    names.extend(["steps", "ended by", "converged", "training"]);
+    names.extend(["arrival", "steps", "ended by", "converged", "training"]);
+    let plans = measured.iter().any(|one| one.planning_ms().is_some());
+    names.extend(plans.then_some("planning, ms"));
     heading(text, &names);
     for one in measured {
         let greedy = one.greedy();
@@ -119,7 +124,9 @@ fn cells(text: &mut String, measured: &[Measured]) {
             cells.push(optional(one.collisions().map(spread)));
             cells.push(optional(one.paper().and_then(|value| value.collisions).map(paper)));
         }
-        cells.extend([thousands(one.steps()), one.ended_by(), one.converged(), seconds(one.wall_s())]);
+        let arrival = format!("{:.1}", one.arrival());
+        cells.extend([arrival, thousands(one.steps()), one.ended_by(), one.converged(), seconds(one.wall_s())]);
+        cells.extend(plans.then(|| optional(one.planning_ms().map(|ms| format!("{ms:.2}")))));
         row(text, &cells);
     }
 }
@@ -166,7 +173,7 @@ fn statistics(text: &mut String, table: &'static PaperTable, measured: &[Measure
 pub(crate) fn csv(tables: &[(&'static PaperTable, Vec<Measured>)]) -> String {
     let names = "table,system,agents,seeds,episodes,success_mean,success_sd,success_iqm,success_low,success_high,\
         sampled_mean,sampled_sd,collision_mean,collision_sd,paper_success,paper_success_sd,paper_collision,\
-        paper_collision_sd,joint_env_steps,converged,ended_by,wall_s";
+        paper_collision_sd,arrival_step,joint_env_steps,converged,ended_by,wall_s,planning_ms";
     let mut rows: Vec<Vec<String>> = vec![names.split(',').map(str::to_owned).collect()];
     let number = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
     for one in tables.iter().flat_map(|(_, measured)| measured) {
@@ -194,10 +201,12 @@ pub(crate) fn csv(tables: &[(&'static PaperTable, Vec<Measured>)]) -> String {
             number(paper.map(|paper| paper.success[1])),
             number(crashed.map(|[mean, _]| mean)),
             number(crashed.map(|[_, deviation]| deviation)),
+            number(Some(one.arrival())),
             number(Some(one.steps())),
             one.converged(),
             one.ended_by(),
             number(Some(one.wall_s())),
+            number(one.planning_ms()),
         ]);
     }
     artifacts::csv(&rows)
