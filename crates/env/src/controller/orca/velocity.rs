@@ -17,7 +17,7 @@ pub(super) struct Settings {
     pub(super) time_horizon: f64,
     /// Neighbours are nearer than this.
     pub(super) neighbour_distance: f64,
-    /// The nearest ones count, at most so many.
+    /// At most this many count, the nearest ones.
     pub(super) max_neighbours: usize,
     /// Radius of every agent.
     pub(super) radius: f64,
