@@ -53,11 +53,10 @@ pub(super) fn remove(run: &Path, which: impl Fn(u32) -> bool) {
         let name = entry.file_name();
         let name = name.to_string_lossy();
         let iteration = name.split('-').next().and_then(|digits| digits.parse().ok());
-        if iteration.is_some_and(&which) || name.starts_with('.') {
-            if let Err(error) = fs::remove_file(entry.path()) {
-                // It only takes room.
-                tracing::warn!(%error, path = %entry.path().display(), "old episodes cannot be removed");
-            }
+        let goes = iteration.is_some_and(&which) || name.starts_with('.');
+        if goes && let Err(error) = fs::remove_file(entry.path()) {
+            // It only takes room.
+            tracing::warn!(%error, path = %entry.path().display(), "old episodes cannot be removed");
         }
     }
 }
