@@ -192,7 +192,7 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
         (_, None) => notes.push("the run is not finished".to_owned()),
     }
     let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-    // Whoever evaluates weights needs no replay buffer.
+    // An evaluation needs no replay buffer.
     let template = Learned { replay: None, ..Learned::init(&Algorithm::new(config)?, &commander)? };
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));

@@ -14,12 +14,12 @@
 //! `maser.trained_distance = false` is the released code: the distance keeps its random initial weights, and losses 4 and 5 are
 //! reported but train nothing.
 
-use crate::train::batch::column;
+use crate::train::batch::{column, plain};
 use crate::train::mappo::sum;
-use crate::train::qmix::{Qmix, plain};
 use crate::train::stats::UpdateStats;
 use candle_core::{Result, Tensor};
-use magex_core::config::MaserConfig;
+use magex_core::config::{MaserConfig, RunConfig};
+use magex_nets::distribution::ActionHeads;
 use magex_nets::ops;
 
 /// Subgoals of the agents of some episodes, and how far every step is from them.
@@ -100,69 +100,67 @@ pub(super) fn cosine(a: &[f32], b: &[f32]) -> f32 {
     if lengths > 0.0 { dot(a, b) / lengths } else { 0.0 }
 }
 
-impl Qmix {
-    /// c_ind L_ind + c_mix (c_expl L_expl + c_dist L_dist) of a slice of a batch of `batch` episodes; `rewards` [T, C] are those of the
-    /// team with the intrinsic part.
-    pub(super) fn maser_losses(
-        &self,
-        subgoals: &Subgoals,
-        values: &Values<'_>,
-        rewards: &[f32],
-        batch: usize,
-    ) -> Result<(Tensor, MaserSums)> {
-        let m = &self.config.maser;
-        let ((steps, c, n), heads) = (subgoals.sizes, self.model.heads());
-        let (a, rows) = (heads.logits(), steps * c * n);
+/// c_ind L_ind + c_mix (c_expl L_expl + c_dist L_dist) of a slice of a batch of `batch` episodes; `rewards` [T, C] are those of the
+/// team with the intrinsic part.
+pub(super) fn losses(
+    config: &RunConfig,
+    heads: &ActionHeads,
+    subgoals: &Subgoals,
+    values: &Values<'_>,
+    rewards: &[f32],
+    batch: usize,
+) -> Result<(Tensor, MaserSums)> {
+    let (m, q) = (&config.maser, &config.qmix);
+    let (steps, c, n) = subgoals.sizes;
+    let (a, rows) = (heads.logits(), steps * c * n);
 
-        // L_ind: mean over the steps of the sum over the agents.
-        let mut targets = Vec::with_capacity(rows);
-        let q = &self.config.qmix;
-        for (joint, next) in values.individual.chunks_exact(n).enumerate() {
-            for (agent, share) in shares(next).into_iter().enumerate() {
-                let intrinsic = -m.lambda * subgoals.plain[joint * n + agent];
-                let gamma = if joint < (steps - 1) * c || q.bootstrap_at_horizon { q.gamma } else { 0.0 };
-                targets.push(share * rewards[joint] + intrinsic + gamma * next[agent]);
-            }
+    // L_ind: mean over the steps of the sum over the agents.
+    let mut targets = Vec::with_capacity(rows);
+    for (joint, next) in values.individual.chunks_exact(n).enumerate() {
+        for (agent, share) in shares(next).into_iter().enumerate() {
+            let intrinsic = -m.lambda * subgoals.plain[joint * n + agent];
+            let gamma = if joint < (steps - 1) * c || q.bootstrap_at_horizon { q.gamma } else { 0.0 };
+            targets.push(share * rewards[joint] + intrinsic + gamma * next[agent]);
         }
-        let individual = (values.taken - column(targets)?)?.sqr()?;
-
-        // L_dist: mean over steps and agents.
-        let row = |row: usize| &values.target[row * a..(row + 1) * a];
-        let goal = |r: usize| row(subgoals.steps[r % (c * n)] * c * n + r % (c * n));
-        let dissimilar: Vec<f32> = (0..rows).map(|r| 1.0 - cosine(row(r), goal(r))).collect();
-        let distance = (&subgoals.distances - column(dissimilar)?)?.sqr()?;
-
-        // L_expl: mean over the steps from t* on, then over the agents, of ln A − entropy, which is the divergence.
-        let weights: Vec<f32> = (0..rows)
-            .map(|r| {
-                let (step, first) = (r / (c * n), subgoals.steps[r % (c * n)]);
-                if step < first { 0.0 } else { 1.0 / (steps - first) as f32 }
-            })
-            .collect();
-        let of = match m.trained_distance {
-            true => values.values.narrow(0, 0, rows)?,
-            false => ops::constant(&values.target[..rows * a], a)?,
-        };
-        // The actions do not matter: only the entropies are read.
-        let entropies = ops::action_log_probs(&of, vec![0; rows * heads.count()], heads)?.get(1)?;
-        let even = libm::log(heads.joint() as f64);
-        let exploration = ((entropies.neg()? + even)? * column(weights)?)?;
-
-        let (per_step, per_agent) = (1.0 / (batch * steps) as f64, 1.0 / (batch * n) as f64);
-        let per_sample = per_step / n as f64;
-        let sums = MaserSums {
-            individual: sum(&individual)? * per_step,
-            exploration: sum(&exploration)? * per_agent,
-            distance: sum(&distance)? * per_sample,
-            intrinsic: -subgoals.plain.iter().map(|&d| f64::from(d)).sum::<f64>() * per_sample,
-        };
-        let mixed = f64::from(m.mixed_coef);
-        let weighted = |loss: &Tensor, weight: f64| loss.sum_all()? * weight;
-        let own = weighted(&individual, per_step * f64::from(m.individual_coef))?;
-        let exploration = weighted(&exploration, per_agent * mixed * f64::from(m.exploration_coef))?;
-        let distance = weighted(&distance, per_sample * mixed * f64::from(m.distance_coef))?;
-        Ok((((own + exploration)? + distance)?, sums))
     }
+    let individual = (values.taken - column(targets)?)?.sqr()?;
+
+    // L_dist: mean over steps and agents.
+    let row = |row: usize| &values.target[row * a..(row + 1) * a];
+    let goal = |r: usize| row(subgoals.steps[r % (c * n)] * c * n + r % (c * n));
+    let dissimilar: Vec<f32> = (0..rows).map(|r| 1.0 - cosine(row(r), goal(r))).collect();
+    let distance = (&subgoals.distances - column(dissimilar)?)?.sqr()?;
+
+    // L_expl: mean over the steps from t* on, then over the agents, of ln A − entropy, which is the divergence.
+    let weights: Vec<f32> = (0..rows)
+        .map(|r| {
+            let (step, first) = (r / (c * n), subgoals.steps[r % (c * n)]);
+            if step < first { 0.0 } else { 1.0 / (steps - first) as f32 }
+        })
+        .collect();
+    let of = match m.trained_distance {
+        true => values.values.narrow(0, 0, rows)?,
+        false => ops::constant(&values.target[..rows * a], a)?,
+    };
+    // The actions do not matter: only the entropies are read.
+    let entropies = ops::action_log_probs(&of, vec![0; rows * heads.count()], heads)?.get(1)?;
+    let even = libm::log(heads.joint() as f64);
+    let exploration = ((entropies.neg()? + even)? * column(weights)?)?;
+
+    let (per_step, per_agent) = (1.0 / (batch * steps) as f64, 1.0 / (batch * n) as f64);
+    let per_sample = per_step / n as f64;
+    let sums = MaserSums {
+        individual: sum(&individual)? * per_step,
+        exploration: sum(&exploration)? * per_agent,
+        distance: sum(&distance)? * per_sample,
+        intrinsic: -subgoals.plain.iter().map(|&d| f64::from(d)).sum::<f64>() * per_sample,
+    };
+    let mixed = f64::from(m.mixed_coef);
+    let weighted = |loss: &Tensor, weight: f64| loss.sum_all()? * weight;
+    let own = weighted(&individual, per_step * f64::from(m.individual_coef))?;
+    let exploration = weighted(&exploration, per_agent * mixed * f64::from(m.exploration_coef))?;
+    let distance = weighted(&distance, per_sample * mixed * f64::from(m.distance_coef))?;
+    Ok((((own + exploration)? + distance)?, sums))
 }
 
 /// Losses of a batch, or of one of its slices, which add up.

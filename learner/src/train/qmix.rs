@@ -17,7 +17,7 @@
 //!
 //! MASER adds its intrinsic reward to the reward and its losses to the loss: [`maser`].
 
-use crate::train::batch::column;
+use crate::train::batch::{column, plain};
 use crate::train::learned::{Learned, Moments, Network};
 use crate::train::mappo::{part, sum, sum_in_order};
 use crate::train::maser::{self, MaserSums, Subgoals};
@@ -41,8 +41,8 @@ type Gradients = Vec<Vec<f32>>;
 /// The algorithm with its settings.
 #[derive(Debug)]
 pub struct Qmix {
-    pub(super) config: RunConfig,
-    pub(super) model: Model,
+    config: RunConfig,
+    model: Model,
 }
 
 impl Qmix {
@@ -110,7 +110,7 @@ impl Qmix {
                     (0..count).map(|k| sum_in_order(results.iter().map(|(gradients, _)| &gradients[k]))).collect();
                 self.descend(&mut networks[..count], &gradients, &sums, &mut total);
             }
-            // 3. The target networks, every so many episodes of the run.
+            // 3. The target networks, as often as the configuration says.
             let episodes = u64::from(iteration) * u64::from(self.config.collect.episodes_per_iteration)
                 + u64::from(step + 1) * u64::from(q.episodes_per_gradient_step);
             let (every, each) = (u64::from(q.target_update_every), u64::from(q.episodes_per_gradient_step));
@@ -230,7 +230,7 @@ impl Qmix {
         if let Some(subgoals) = &subgoals {
             let view =
                 maser::Values { taken: &taken, values: &values, target: &target, individual: &individual[c * n..] };
-            let (own, maser) = self.maser_losses(subgoals, &view, &rewards, batch)?;
+            let (own, maser) = maser::losses(&self.config, heads, subgoals, &view, &rewards, batch)?;
             loss = (loss + (own * f64::from(self.config.maser.loss_factor))?)?;
             sums.maser = maser;
         }
@@ -238,11 +238,6 @@ impl Qmix {
         let flat = |(network, variables): (&Network, &Vec<Var>)| Ok(network.params.gradient(variables, &store)?);
         Ok((trained.iter().zip(&variables).map(flat).collect::<Result<Gradients>>()?, sums))
     }
-}
-
-/// The numbers of a tensor, row-major.
-pub(super) fn plain(tensor: &Tensor) -> CandleResult<Vec<f32>> {
-    tensor.flatten_all()?.to_vec1()
 }
 
 /// Σ over the columns of each row: [R, A] → `[R]`.

@@ -80,7 +80,7 @@ section! {
 }
 
 impl QmixConfig {
-    /// ε after so many joint environment steps.
+    /// ε after a number of joint environment steps.
     pub fn epsilon(&self, steps: u64) -> f32 {
         let share = (steps as f64 / self.epsilon_steps as f64).min(1.0);
         let (start, end) = (f64::from(self.epsilon_start), f64::from(self.epsilon_end));

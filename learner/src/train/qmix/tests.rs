@@ -182,7 +182,7 @@ fn a_batch_that_is_not_finite_changes_nothing_and_is_counted() {
 }
 
 #[test]
-fn targets_are_copied_every_so_many_episodes() {
+fn targets_are_copied_as_often_as_the_configuration_says() {
     let task = TaskConfig { horizon: 2, ..TaskConfig::simple_spread(2, Spawn::Uniform) };
     let mut config = config(Algorithm::Qmix, task, 4);
     config.qmix.target_update_every = 6;
