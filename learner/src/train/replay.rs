@@ -1,8 +1,8 @@
 //! The replay buffer: the newest episodes of a run, whatever weights collected them.
 //!
 //! It keeps joint states, and no observations: an observation vector repeats what the others see, so that N of them are about N times
-//! as long, and computing them takes less time than a hundredth of the gradient step that reads them. To keep actions alone and
-//! simulate again would take a twentieth of the room, but the learner links no environment.
+//! as long, and a batch's are computed in a small part of the time that its gradient takes. To keep actions alone and simulate again
+//! would take a seventeenth of the room, but the learner links no environment.
 
 use magex_core::config::RunConfig;
 use magex_core::rng::Stream;
