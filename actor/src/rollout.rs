@@ -16,7 +16,7 @@ use magex_core::statics::Statics;
 use magex_core::task::{ActionCode, TaskConfig};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
 use magex_env::{Controller, Env, new_env};
-use magex_nets::executor::{Model, Policy};
+use magex_nets::executor::{Act, Model};
 use magex_nets::features::Symmetry;
 use magex_nets::params::ParamError;
 use magex_proto::goals::{GoalReply, GoalRequest};
@@ -47,7 +47,7 @@ pub enum RolloutError<E> {
 
 /// What drives the agents of a shard.
 enum Driver<'a> {
-    Policy(&'a dyn Policy, Carried),
+    Policy(&'a dyn Act, Carried),
     Controller(Box<dyn Controller>),
 }
 
@@ -56,7 +56,7 @@ pub type MakeController = Box<dyn Fn(&TaskConfig, &[Key]) -> Result<Box<dyn Cont
 
 /// Where the drivers of shards come from.
 enum Source {
-    Policy(Box<dyn Policy>),
+    Policy(Box<dyn Act>),
     Controller(MakeController),
 }
 
@@ -85,6 +85,17 @@ impl Roller {
     /// With a controller instead of a policy (evaluation only).
     pub fn with_controller(config: &RunConfig, make: MakeController) -> Result<Self, ParamError> {
         Ok(Self { config: config.clone(), model: Model::new(config)?, source: Source::Controller(make) })
+    }
+
+    /// Share of random actions of action values; `None` for a policy, which is sampled. Evaluations know no iteration: they explore as
+    /// little as training does in the end.
+    fn epsilon(&self, shard: &Shard) -> Option<f32> {
+        let (config, qmix) = (&self.config, &self.config.qmix);
+        let steps = u64::from(shard.iteration.0) * config.steps_per_iteration();
+        config.run.algorithm.off_policy().then(|| match shard.kind {
+            ShardKind::Train => qmix.epsilon(steps),
+            ShardKind::Eval => qmix.epsilon_end,
+        })
     }
 
     /// Rolls out all episodes of a shard side by side. `assign` is asked once for the goals of all of them.
@@ -124,6 +135,7 @@ impl Roller {
         let mut recording = (Vec::new(), Vec::new());
         let mut rewards = vec![0.0; b * n];
         let mut chosen = KeyedChooser::new(self.model.heads(), n, shard.mode, keys.iter().map(|k| k.action));
+        chosen.epsilon = self.epsilon(shard);
         for step in 0..=steps {
             state.read(&worlds)?;
             if keep {

@@ -1,15 +1,19 @@
 //! Checkpoints: everything that learning changes, written so that a kill at any byte leaves the previous one usable.
 //!
 //! A checkpoint is a folder `checkpoints/<iteration>` with `weights.safetensors` (every network of [`Learned`]),
-//! `optimiser.safetensors` (its Adam moments), `state.json` (counters, value statistics) and, written last, `manifest.json`
-//! with the SHA-256 of each. It is written under a temporary name, flushed to disk, and renamed.
+//! `optimiser.safetensors` (what their optimisers remember), `state.json` (counters, value statistics) and, written last, `manifest.json`
+//! with the SHA-256 of each. It is written under a temporary name, flushed to disk, and renamed. Of a replay buffer it has the
+//! hashes: the episodes are in files of their own, which checkpoints share ([`replay`]).
 
 pub mod disk;
+mod replay;
+
+pub use replay::FOLDER as REPLAY;
 
 use self::disk::{Disk, FileSystem};
-use crate::train::adam::Adam;
 use crate::train::gae::ValueNorm;
-use crate::train::learned::{Learned, Network};
+use crate::train::learned::{Learned, Moments, Network};
+use crate::train::replay::Replay;
 use magex_core::sha256;
 use magex_nets::params::{ParamError, Params, to_safetensors};
 use serde::{Deserialize, Serialize};
@@ -105,19 +109,23 @@ struct State {
     format: u32,
     progress: Progress,
     value_norm: ValueNorm,
+    /// Updates done by each network's optimiser, Adam or another.
     adam_steps: BTreeMap<String, u64>,
+    /// Iterations in the replay buffer, with the SHA-256 of their files; not there for algorithms without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    replay: Option<BTreeMap<u32, String>>,
 }
 
-/// The Adam moments of every network: `<network>.first.…` and `<network>.second.…`.
+/// What the optimisers remember: `<network>.first.…` and `<network>.second.…`, as far as a network's optimiser has them.
 fn moments(learned: &Learned) -> Result<Vec<u8>, ParamError> {
     let with = |network: &Network, which: &str, values: &[f32]| {
         let params = Params { entries: network.params.entries.clone(), values: values.to_vec() };
-        (format!("{}.{which}", network.name), params)
+        (!values.is_empty()).then(|| (format!("{}.{which}", network.name), params))
     };
     let of = |network: &Network| {
-        [with(network, "first", &network.adam.first), with(network, "second", &network.adam.second)]
+        [with(network, "first", &network.moments.first), with(network, "second", &network.moments.second)]
     };
-    let sets: Vec<(String, Params)> = learned.networks.iter().flat_map(of).collect();
+    let sets: Vec<(String, Params)> = learned.networks.iter().flat_map(of).flatten().collect();
     let named: Vec<(&str, &Params)> = sets.iter().map(|(name, params)| (name.as_str(), params)).collect();
     to_safetensors(&named, "{\"format\":1}")
 }
@@ -153,6 +161,9 @@ pub fn write_on(
     let parent = run.join("checkpoints");
     let name = format!("{:06}", progress.iteration);
     let (temporary, folder) = (parent.join(format!(".{name}.tmp")), parent.join(&name));
+    if let Some(replay) = &learned.replay {
+        replay::write(disk, run, replay)?;
+    }
     if let Err(error) = fill(disk, &temporary, progress, learned) {
         // Half a checkpoint is of no use and takes room, which may be what is missing.
         let _ = disk.remove_dir(&temporary);
@@ -178,6 +189,10 @@ pub fn write_on(
             tracing::warn!(%error, path = %old.display(), "an old checkpoint cannot be removed");
         }
     }
+    if let Some(replay) = &learned.replay {
+        let oldest = list(run).first().and_then(|folder| numbered(folder.clone())).map_or(0, |(number, ..)| number);
+        replay::remove(run, |iteration| u64::from(iteration) + (replay.block_count() as u64) < oldest);
+    }
     Ok(folder)
 }
 
@@ -191,7 +206,8 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
         format: FORMAT,
         progress: progress.clone(),
         value_norm: learned.value_norm,
-        adam_steps: learned.networks.iter().map(|network| (network.name.clone(), network.adam.steps)).collect(),
+        adam_steps: learned.networks.iter().map(|network| (network.name.clone(), network.moments.steps)).collect(),
+        replay: learned.replay.as_ref().map(Replay::index),
     };
     let state = serde_json::to_vec_pretty(&state).map_err(in_file(&folder.join("state.json")))?;
     let mut contents: Vec<(&str, Vec<u8>)> =
@@ -207,8 +223,10 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
     disk.sync(folder).map_err(in_file(folder))
 }
 
-/// Removes what a kill left of checkpoints that were being written. No other process may be writing.
-pub fn clean(run: &Path) {
+/// Removes what a kill left of checkpoints that were being written, and the episodes of iterations from `iteration` on, which will
+/// be collected again. No other process may be writing.
+pub fn clean(run: &Path, iteration: u32) {
+    replay::remove(run, |other| other >= iteration);
     let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
     for path in entries.map(|entry| entry.path()).filter(|path| hidden(path, ".tmp").is_some()) {
         if let Err(error) = fs::remove_dir_all(&path) {
@@ -245,7 +263,7 @@ fn number(digits: &str) -> Option<u64> {
     digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse().ok())?
 }
 
-/// Checks a checkpoint's hashes and reads it into networks laid out like `template`.
+/// Checks a checkpoint's hashes and reads it into networks laid out like `template`, and its replay buffer if `template` has one.
 pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), CheckpointError> {
     let corrupt = |file: &str, reason: &str| in_file(&folder.join(file))(reason);
     let load = |file: &str| fs::read(folder.join(file)).map_err(in_file(&folder.join(file)));
@@ -277,12 +295,23 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
         let steps = state.adam_steps.get(name);
         let steps = *steps.ok_or_else(|| corrupt("state.json", &format!("adam_steps.{name} is missing")))?;
         let params = load(&contents[0], name)?;
-        let first = load(&contents[1], &format!("{name}.first"))?.values;
-        let second = load(&contents[1], &format!("{name}.second"))?.values;
-        Ok(Network { params, adam: Adam { first, second, steps }, ..network.clone() })
+        let moment = |which: &str, fresh: &[f32]| match fresh.is_empty() {
+            true => Ok(Vec::new()),
+            false => load(&contents[1], &format!("{name}.{which}")).map(|moment| moment.values),
+        };
+        let first = moment("first", &network.moments.first)?;
+        let second = moment("second", &network.moments.second)?;
+        Ok(Network { params, moments: Moments { first, second, steps }, ..network.clone() })
     };
     let networks = template.networks.iter().map(restore).collect::<Result<Vec<_>, CheckpointError>>()?;
-    Ok((state.progress, Learned { networks, value_norm: state.value_norm }))
+    let replay = match &template.replay {
+        Some(empty) => {
+            let index = state.replay.ok_or_else(|| corrupt("state.json", "replay is missing"))?;
+            Some(replay::read(folder, empty, &index)?)
+        }
+        None => None,
+    };
+    Ok((state.progress, Learned { networks, value_norm: state.value_norm, replay }))
 }
 
 /// Rejects a run folder whose newest checkpoint has another format, before anything else in it is read: its configuration

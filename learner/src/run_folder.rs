@@ -12,7 +12,8 @@ pub const CONFIG_FILE: &str = "config.toml";
 /// What the root of a new file system contains, what a process that began nothing may leave, and half a configuration.
 const NOTHING: [&str; 3] = ["lost+found", LOCK_FILE, ".config.toml.tmp"];
 /// What a run writes before its first iteration is complete.
-const BEGINNING: [&str; 6] = [CONFIG_FILE, ".config.toml.tmp", "metrics.jsonl", "checkpoints", "logs", "tensorboard"];
+const BEGINNING: [&str; 7] =
+    [CONFIG_FILE, ".config.toml.tmp", "metrics.jsonl", "checkpoints", "replay", "logs", "tensorboard"];
 
 /// What a run folder contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

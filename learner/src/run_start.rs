@@ -2,10 +2,9 @@
 
 use crate::checkpoint::{self, CheckpointError};
 use crate::run_folder::CONFIG_FILE;
-use crate::train::adam::Adam;
+use crate::train::algorithm::Algorithm;
 use crate::train::commander_ppo::CommanderPpo;
 use crate::train::learned::{Learned, Network};
-use crate::train::mappo::Mappo;
 use crate::trainer::TrainError;
 use magex_core::config::{ConfigError, RunConfig};
 use magex_core::sha256;
@@ -15,7 +14,7 @@ use toml::{Table, Value};
 
 /// Keys of `[run]` that decide what is learned from the first iteration on. All others decide when a run ends, what it measures
 /// and what it keeps.
-const FIXED: [&str; 3] = ["seed", "initial_weights", "initial_optimiser"];
+const FIXED: [&str; 4] = ["algorithm", "seed", "initial_weights", "initial_optimiser"];
 /// Keys that do not decide whether evaluations reached the target.
 const WITHOUT_TARGET: [&str; 4] = ["max_steps", "final_episodes", "checkpoint_every", "keep_checkpoints"];
 
@@ -127,7 +126,8 @@ impl Parent {
         checkpoint::check_format(folder)?;
         let config = RunConfig::from_toml(&text).map_err(|error| unusable(format!("{CONFIG_FILE}: {error}")))?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-        let template = Learned::init(&Mappo::new(&config)?, &commander)?;
+        // Weights and optimisers: the new run fills a replay buffer of its own.
+        let template = Learned { replay: None, ..Learned::init(&Algorithm::new(&config)?, &commander)? };
         let (progress, learned, skipped) = checkpoint::read_latest(folder, &template).map_err(|error| match error {
             CheckpointError::None(_) => unusable("it has no checkpoint to begin from".to_owned()),
             other => other.into(),
@@ -186,10 +186,10 @@ impl Parent {
                 return Err(self.mismatch(config, &network.name, &own, &theirs)?);
             }
             network.params.values.clone_from(&parent.params.values);
-            network.adam = match config.run.initial_optimiser {
-                true => parent.adam.clone(),
-                false => Adam::new(parent.params.values.len()),
-            };
+            // Otherwise the optimiser is a fresh one.
+            if config.run.initial_optimiser {
+                network.moments = parent.moments.clone();
+            }
         }
         if fresh.value_norm.enabled == self.learned.value_norm.enabled {
             fresh.value_norm = self.learned.value_norm;

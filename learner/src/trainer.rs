@@ -22,10 +22,10 @@ use crate::report::tensorboard::EventFile;
 use crate::run_events::{CollectError, RunEvent, parse_report};
 use crate::run_folder::CONFIG_FILE;
 use crate::run_start::{Changes, Parent, continued};
-use crate::train::batch::Batch;
+use crate::train::algorithm::Algorithm;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
-use crate::train::mappo::Mappo;
+use crate::train::replay::Replay;
 use crate::train::stats::UpdateStats;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, RunId, Shard, WeightsVersion};
@@ -54,7 +54,7 @@ pub struct Trainer {
     folder: PathBuf,
     /// Which folder that was at the start.
     place: Option<(u64, u64)>,
-    mappo: Mappo,
+    algorithm: Algorithm,
     commander: CommanderPpo,
     learned: Learned,
     progress: Progress,
@@ -115,7 +115,7 @@ impl Trainer {
         let mut trainer = Self::prepare(&config, RunId(String::new()), folder, threads)?;
         let (mut progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
         trainer.run_id = RunId(progress.run_id.clone());
-        checkpoint::clean(folder);
+        checkpoint::clean(folder, progress.iteration);
         if changes.is_empty() {
             trainer.complete = summary_of(folder, progress.iteration, &learned)?;
         } else {
@@ -165,9 +165,10 @@ impl Trainer {
     }
 
     fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
-        let mappo = Mappo::new(config)?;
+        check_buffer(config)?;
+        let algorithm = Algorithm::new(config)?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-        let learned = Learned::init(&mappo, &commander)?;
+        let learned = Learned::init(&algorithm, &commander)?;
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
         let pool = pool(threads.max(1))?;
         let toml = config.to_toml()?;
@@ -185,7 +186,7 @@ impl Trainer {
             run_id,
             folder: folder.to_owned(),
             place: identity(folder),
-            mappo,
+            algorithm,
             commander,
             learned,
             progress,
@@ -349,11 +350,8 @@ impl Trainer {
         let iteration = self.progress.iteration;
         let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
         let clock = Instant::now();
-        let (mappo, learned, seed) = (&self.mappo, &mut self.learned, self.config.run.seed);
-        let stats = self.pool.install(|| {
-            let batch = Batch::new(seed, mappo.spec(), trajectories);
-            mappo.update(learned, &batch, iteration, done.min(1.0))
-        })?;
+        let (algorithm, learned, seed) = (&self.algorithm, &mut self.learned, self.config.run.seed);
+        let stats = self.pool.install(|| algorithm.update(learned, seed, trajectories, iteration, done.min(1.0)))?;
         timing.executor_s = clock.elapsed().as_secs_f64();
         let clock = Instant::now();
         let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
@@ -403,6 +401,21 @@ impl Trainer {
 
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
+    }
+}
+
+/// Refuses a replay buffer that will not fit into memory when it is full: hours later, the run would be killed.
+fn check_buffer(config: &RunConfig) -> Result<(), TrainError> {
+    if !config.run.algorithm.off_policy() {
+        return Ok(());
+    }
+    let (episodes, needed) = (config.qmix.buffer_episodes, Replay::bytes(config));
+    match magex_runtime::limits::available_memory() {
+        Some(available) if available < needed => {
+            let fit = (available / 2 / Replay::episode_bytes(config)).max(1);
+            Err(TrainError::Buffer { episodes, needed, available, fit })
+        }
+        _ => Ok(()),
     }
 }
 

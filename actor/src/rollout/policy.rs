@@ -3,7 +3,7 @@
 use magex_core::ids::{Mode, Shard};
 use magex_core::rng::{Key, Stream, sequence};
 use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{Chooser, Input, Model, Policy};
+use magex_nets::executor::{Act, Chooser, Input, Model};
 use magex_nets::features::Features;
 use magex_nets::ops::GraphNoise;
 use std::sync::Arc;
@@ -14,6 +14,8 @@ pub(super) struct KeyedChooser<'a> {
     /// `[B]`; `None` takes the most likely actions.
     streams: Option<Vec<Stream>>,
     agents: usize,
+    /// ε of action values; `None` samples from a policy's distribution.
+    pub(super) epsilon: Option<f32>,
     /// [B·N, H]
     pub(super) actions: Vec<u8>,
     /// `[B·N]`
@@ -31,6 +33,7 @@ impl<'a> KeyedChooser<'a> {
             heads,
             streams: (mode == Mode::Sampled).then_some(streams),
             agents,
+            epsilon: None,
             actions: vec![0; rows * heads.count()],
             log_probs: vec![0.0; rows],
             not_finite: None,
@@ -46,7 +49,10 @@ impl Chooser for KeyedChooser<'_> {
         let components = self.heads.count();
         let action = &mut self.actions[row * components..(row + 1) * components];
         let stream = self.streams.as_mut().map(|streams| &mut streams[row / self.agents]);
-        self.log_probs[row] = self.heads.choose(logits, stream, action);
+        self.log_probs[row] = match self.epsilon {
+            Some(epsilon) => self.heads.choose_epsilon_greedy(logits, epsilon, stream, action),
+            None => self.heads.choose(logits, stream, action),
+        };
         action
     }
 }
@@ -71,7 +77,7 @@ impl Carried {
     /// Acts in one joint step; the memory moves on.
     pub(super) fn act(
         &mut self,
-        policy: &dyn Policy,
+        policy: &dyn Act,
         features: &Features,
         step: usize,
         choose: &mut dyn Chooser,

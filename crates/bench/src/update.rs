@@ -89,7 +89,7 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
             for (epochs, times) in (1u32..).zip(&mut time) {
                 config.mappo.epochs = epochs;
                 let mappo = Mappo::new(&config)?;
-                let mut learned = Learned { networks: mappo.init()?, value_norm: mappo.value_norm() };
+                let mut learned = Learned { networks: mappo.init()?, value_norm: mappo.value_norm(), replay: None };
                 let batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
                 let clock = Instant::now();
                 mappo.update(&mut learned, &batch, 0, 0.0)?;

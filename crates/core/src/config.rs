@@ -4,6 +4,7 @@
 //! Reading is strict: an unknown key or a value out of range is an error that names the field and the remedy.
 
 mod executor;
+mod off_policy;
 mod raw;
 mod setting;
 
@@ -14,6 +15,7 @@ use serde::de::IntoDeserializer as _;
 use serde::{Deserialize, Serialize};
 
 pub use executor::{ExecutorConfig, ExecutorKind, Observes};
+pub use off_policy::{Algorithm, MaserConfig, QmixConfig};
 pub use setting::Setting;
 
 /// Why a configuration was refused: it is not TOML, or has a key that does not exist, or a value of the wrong type or out of
@@ -43,8 +45,12 @@ pub struct RunConfig {
     pub commander: CommanderConfig,
     /// What an iteration collects.
     pub collect: CollectConfig,
-    /// The learner's algorithm.
+    /// MAPPO, the learner's algorithm unless `run.algorithm` names another.
     pub mappo: MappoConfig,
+    /// QMIX, which MASER builds on.
+    pub qmix: QmixConfig,
+    /// What MASER adds to QMIX.
+    pub maser: MaserConfig,
 }
 
 /// Limit of the seed of a run: what TOML's whole numbers hold.
@@ -59,6 +65,8 @@ const EPISODES_MAX: u32 = 100_000;
 section! {
     /// `[run]`
     RunSection {
+        /// What the learner does with the episodes.
+        algorithm: Algorithm = Algorithm::Mappo;
         /// Seed of every random stream.
         seed: u64 = 1, 0..=SEED_MAX;
         /// Budget: joint environment steps to train on.
@@ -243,6 +251,8 @@ impl Default for RunConfig {
                 critic_learning_rate: 1e-3,
                 ..MappoConfig::default()
             },
+            qmix: QmixConfig::default(),
+            maser: MaserConfig::default(),
         }
     }
 }
@@ -320,6 +330,12 @@ impl RunConfig {
         if episodes % shards != 0 {
             let problem = format!("{shards} must divide collect.episodes_per_iteration = {episodes}");
             return Err(FieldError::new("collect.shards_per_iteration", problem));
+        }
+        self.qmix.check_ranges("qmix")?;
+        self.maser.check_ranges("maser")?;
+        self.check_algorithm()?;
+        if self.run.algorithm != Algorithm::Mappo {
+            return Ok(());
         }
         check_range("mappo.chunk_length", chunk, 1, horizon)?;
         if self.executor.memory() > 0 && !horizon.is_multiple_of(chunk) {

@@ -42,6 +42,8 @@ pub enum Purpose {
     RandomGoals = 14,
     /// Randomness of a controller without weights (noise, random actions); indices: set or iteration, episode, 1 in evaluation.
     Controller = 15,
+    /// Which episodes of the replay buffer a gradient step takes; indices: iteration, gradient step.
+    Replay = 16,
     /// Resamples of the bootstrap; indices: resample, system, task.
     Bootstrap = 31,
 }

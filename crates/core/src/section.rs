@@ -28,6 +28,15 @@ macro_rules! section {
                 None
             }
 
+            /// The first key whose value is another one there.
+            #[allow(dead_code, reason = "not every section belongs to one of several algorithms")]
+            pub(crate) fn changed(&self, other: &Self) -> Option<&'static str> {
+                $(if self.$key != other.$key {
+                    return Some(stringify!($key));
+                })*
+                None
+            }
+
             /// `Ok` if every value is in its range; `section` is the section's dotted name.
             pub(crate) fn check_ranges(&self, section: &str) -> Result<(), $crate::error::FieldError> {
                 let key = |name| $crate::toml_table::dotted(section, name);

@@ -7,7 +7,7 @@ use crate::logging::set_live_line;
 use crate::planning_clock::PlanningClock;
 use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
-use magex_core::config::{CommanderPolicy, RunConfig};
+use magex_core::config::{Algorithm, CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
@@ -206,7 +206,9 @@ impl Variation {
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
         config.task.horizon = self.horizon.unwrap_or(config.task.horizon);
         // Evaluation does not train: the chunk length need not divide the horizon.
-        config.mappo.chunk_length = 1;
+        if config.run.algorithm == Algorithm::Mappo {
+            config.mappo.chunk_length = 1;
+        }
         let config = config.validated()?;
         if let Some(classical) = self.controller.classical() {
             classical.check(&config.task).map_err(|error| usage(format!("--{error}")))?;

@@ -5,6 +5,7 @@
 //! | `config.toml` | the effective configuration, every key |
 //! | `metrics.jsonl` | one line per iteration |
 //! | `checkpoints/` | the latest checkpoints, weights as safetensors |
+//! | `replay/` | episodes of the replay buffer, for algorithms that have one |
 //! | `weights.safetensors`, `summary.json`, `recordings.json` | the result of a finished run |
 //! | `curve.svg`, `replay.html` | pictures |
 //! | `tensorboard/` | the numbers of metrics.jsonl for TensorBoard |
@@ -18,9 +19,9 @@ use magex_core::sha256;
 use magex_learner::checkpoint::{self, CheckpointError};
 use magex_learner::run_folder::{Claim, FolderError};
 use magex_learner::run_lock::LockError;
+use magex_learner::train::algorithm::Algorithm;
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
-use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
 /// The effective configuration.
@@ -34,9 +35,13 @@ pub(crate) fn default_name(config: &RunConfig) -> String {
     format!("{}-s{}", group_name(config), config.run.seed)
 }
 
-/// `<task>-<N>-<executor>`
+/// `<task>-<N>-<executor>`, or the algorithm where that is not MAPPO.
 pub(crate) fn group_name(config: &RunConfig) -> String {
-    format!("{}-{}-{}", config.task.name, config.task.agents, config.executor.kind)
+    let system = match config.run.algorithm {
+        magex_core::config::Algorithm::Mappo => config.executor.kind.to_string(),
+        other => other.to_string(),
+    };
+    format!("{}-{}-{system}", config.task.name, config.task.agents)
 }
 
 /// The folder of all runs, unless an option says otherwise.
@@ -187,7 +192,8 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
         (_, None) => notes.push("the run is not finished".to_owned()),
     }
     let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-    let template = Learned::init(&Mappo::new(config)?, &commander)?;
+    // An evaluation needs no replay buffer.
+    let template = Learned { replay: None, ..Learned::init(&Algorithm::new(config)?, &commander)? };
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));
     notes.push(format!("using checkpoint {:06}", progress.iteration));
@@ -201,6 +207,9 @@ pub(crate) fn what_is_wrong(error: &CheckpointError) -> String {
     };
     let text = |part: Option<&std::ffi::OsStr>| part.map(|p| p.to_string_lossy().into_owned()).unwrap_or_default();
     let checkpoint = text(path.parent().and_then(Path::file_name));
+    if checkpoint == checkpoint::REPLAY {
+        return format!("the replay buffer is corrupt ({}: {reason})", text(path.file_name()));
+    }
     format!("checkpoint {checkpoint} is corrupt ({}: {reason})", text(path.file_name()))
 }
 

@@ -72,6 +72,58 @@ impl ActionHeads {
     }
 }
 
+impl ActionHeads {
+    /// The best choice of each component by its values `[A]`, the first of equals.
+    pub fn best(&self, values: &[f32], action: &mut [u8]) {
+        let mut at = 0;
+        for (&size, slot) in self.sizes.iter().zip(action) {
+            let values = &values[at..at + size];
+            *slot = values.iter().enumerate().fold(0, |best, (i, &x)| if x > values[best] { i } else { best }) as u8;
+            at += size;
+        }
+    }
+
+    /// The value of an action: the sum of the values of its choices.
+    pub fn value(&self, values: &[f32], action: &[u8]) -> f32 {
+        let (mut at, mut total) = (0, 0.0);
+        for (&size, &choice) in self.sizes.iter().zip(action) {
+            total += values[at + usize::from(choice)];
+            at += size;
+        }
+        total
+    }
+
+    /// Joint choices of all components.
+    pub fn joint(&self) -> usize {
+        self.sizes.iter().product()
+    }
+
+    /// ε-greedy: with probability ε any action, all alike, otherwise the best one. Returns the log-probability of the action
+    /// that it is. `stream` = None takes the best one.
+    pub fn choose_epsilon_greedy(
+        &self,
+        values: &[f32],
+        epsilon: f32,
+        stream: Option<&mut Stream>,
+        action: &mut [u8],
+    ) -> f32 {
+        self.best(values, action);
+        let Some(stream) = stream else { return 0.0 };
+        let mut greedy = true;
+        // As many draws whatever happens: what comes later does not depend on it.
+        let explore = stream.uniform32() < epsilon;
+        for (&size, slot) in self.sizes.iter().zip(action) {
+            let any = stream.below(size as u32) as u8;
+            if explore {
+                greedy &= *slot == any;
+                *slot = any;
+            }
+        }
+        let any = epsilon / self.joint() as f32;
+        libm::logf(if greedy { any + (1.0 - epsilon) } else { any }).min(0.0)
+    }
+}
+
 /// x − max − ln Σ exp(x − max) for up to sixteen numbers.
 #[inline]
 fn log_softmax(logits: &[f32], out: &mut [f32]) {
@@ -99,6 +151,27 @@ mod tests {
             let sum: f32 = out.iter().map(|x| x.exp()).sum();
             assert!((sum - 1.0).abs() < 1e-5, "{sum}");
         }
+    }
+
+    #[test]
+    fn epsilon_greedy_takes_the_best_choices_or_any_with_the_probability_that_it_tells() {
+        let heads = ActionHeads::new(vec![3, 2]).unwrap();
+        // The first of equals.
+        let values = [1.0, 5.0, 5.0, 2.0, -1.0];
+        let mut action = [9u8; 2];
+        assert_eq!((heads.choose_epsilon_greedy(&values, 0.7, None, &mut action), action), (0.0, [1, 0]));
+        assert_eq!((heads.value(&values, &[2, 1]), heads.joint()), (4.0, 6));
+        let mut stream = Key::new(1, Purpose::Action, &[]).stream();
+        let mut seen = [0u32; 6];
+        for _ in 0..12_000 {
+            let log_prob = heads.choose_epsilon_greedy(&values, 0.3, Some(&mut stream), &mut action);
+            let expected: f32 = if action == [1, 0] { 0.75 } else { 0.05 };
+            assert!((log_prob - expected.ln()).abs() < 1e-6);
+            seen[usize::from(action[0] * 2 + action[1])] += 1;
+        }
+        assert!((8800..9200).contains(&seen[2]), "{seen:?}");
+        assert!(seen.iter().enumerate().all(|(k, n)| k == 2 || (500..700).contains(n)), "{seen:?}");
+        assert_eq!(heads.choose_epsilon_greedy(&values, 0.0, Some(&mut stream), &mut action), 0.0);
     }
 
     #[test]

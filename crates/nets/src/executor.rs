@@ -1,5 +1,5 @@
 //! The action executor (paper, section 4.2). A [`Model`] says which networks a run has and builds its [`Policy`] and value
-//! function on them; rollouts call [`Policy::act`], the update calls [`Policy::evaluate`].
+//! function on them; rollouts call [`Act::act`], the update calls [`Policy::evaluate`]. QMIX has a [`QNetwork`] and a [`Mixer`] instead.
 //!
 //! | kind | team features E_a | goal features | memory |
 //! |---|---|---|---|
@@ -25,8 +25,10 @@ mod flat;
 mod local;
 mod mat;
 mod memory;
+mod mixer;
 mod model;
 mod policy;
+mod q_network;
 mod team;
 
 use crate::features::{FeatureSpec, Features, FlatSpec};
@@ -41,8 +43,10 @@ use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
 use team::TeamNet;
 
+pub use mixer::{Distance, Mixer};
 pub use model::{Model, Part};
-pub use policy::{Chooser, Evaluated, Independent, Policy};
+pub use policy::{Act, Chooser, Evaluated, Independent, Policy};
+pub use q_network::{QNetwork, one_hot};
 
 /// What a network sees: L steps of C sequences of N agents, rows ordered [L, C, N].
 #[derive(Debug)]
@@ -130,6 +134,22 @@ impl Layer {
         Ok(Self {
             w: params.tensor(&format!("{name}.weight"), &[inputs, outputs], Init::Orthogonal(gain))?,
             b: params.tensor(&format!("{name}.bias"), &[outputs], Init::Constant(0.0))?,
+            act,
+            constant_input: false,
+        })
+    }
+
+    /// A layer whose weights and biases are uniform within ± 1/√inputs at the start, as PyTorch draws them.
+    pub(crate) fn uniform(
+        params: &mut ParamBuilder,
+        name: &str,
+        (inputs, outputs): (usize, usize),
+        act: Activation,
+    ) -> Result<Self, ParamError> {
+        let init = Init::Uniform(1.0 / (inputs as f64).sqrt());
+        Ok(Self {
+            w: params.tensor(&format!("{name}.weight"), &[inputs, outputs], init)?,
+            b: params.tensor(&format!("{name}.bias"), &[outputs], init)?,
             act,
             constant_input: false,
         })

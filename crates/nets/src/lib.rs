@@ -3,7 +3,7 @@
 //! | module | content |
 //! |---|---|
 //! | [`features`] | from states to the numbers that networks see |
-//! | [`executor`] | the action executor and its ablations: [`executor::Model`], [`executor::Policy`] |
+//! | [`executor`] | the action executor and its ablations: [`executor::Model`], [`executor::Policy`], [`executor::QNetwork`] |
 //! | [`commander`] | the goal commander |
 //! | [`distribution`] | categorical actions |
 //! | [`ops`] | layers as custom operations with hand-written gradients |

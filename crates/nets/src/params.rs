@@ -28,6 +28,8 @@ pub enum Init {
     Orthogonal(f64),
     /// One value.
     Constant(f32),
+    /// Uniform within plus and minus a bound.
+    Uniform(f64),
 }
 
 /// Name, shape and place of one tensor.
@@ -111,6 +113,10 @@ impl Params {
         for entry in &entries {
             match entry.init {
                 Init::Constant(value) => values.resize(entry.range().end, value),
+                Init::Uniform(bound) => {
+                    let count = entry.range().len();
+                    values.extend((0..count).map(|_| stream.range(-bound, bound) as f32));
+                }
                 Init::Orthogonal(gain) => values.extend(orthogonal(&entry.shape, gain, &mut stream)),
             }
         }

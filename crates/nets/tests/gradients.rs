@@ -90,6 +90,32 @@ fn linear_and_norm() {
 }
 
 #[test]
+fn mixing_distances_and_elu() {
+    for (rows, inputs, units) in [(3, 5, 32), (4, 2, 1), (2, 3, 21)] {
+        let (x, w, b) = (var(&[rows, inputs], 1), var(&[rows, inputs * units], 2), var(&[rows, units], 3));
+        let y = || ops::mix(&x, &w, &b).unwrap();
+        check(&[&x, &w, &b], &y);
+        // The same by candle's own operations.
+        let product = x.reshape((rows, 1, inputs)).unwrap().matmul(&w.reshape((rows, inputs, units)).unwrap()).unwrap();
+        let gap = (product.reshape((rows, units)).unwrap() + b.as_tensor() - y()).unwrap().abs().unwrap();
+        assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-5);
+        assert!(ops::mix(&x, &b, &b).is_err() || inputs == 1);
+    }
+    let x = var(&[6, 5], 4);
+    // Row 2 is its own other: its distance is zero, and so is its gradient.
+    check(&[&x], &|| ops::row_distances(&x, vec![1, 0, 2, 1, 1, 4]).unwrap());
+    let to_itself = ops::row_distances(&x, (0..6).collect()).unwrap();
+    assert_eq!(to_itself.to_vec1::<f32>().unwrap(), [0.0; 6]);
+    let gradient = to_itself.sum_all().unwrap().backward().unwrap().get(&x).unwrap().flatten_all().unwrap();
+    assert_eq!(gradient.to_vec1::<f32>().unwrap(), [0.0; 30]);
+    assert!(ops::row_distances(&x, vec![0, 1, 2, 3, 4, 6]).is_err());
+    let x = var(&[3, 21], 5);
+    check(&[&x], &|| ops::elu(&x).unwrap());
+    let gap = (ops::elu(&x).unwrap() - x.elu(1.0).unwrap()).unwrap().abs().unwrap();
+    assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-6);
+}
+
+#[test]
 fn recurrent_unit() {
     let (x, w, b) = (var(&[4, 3, 48], 1), var(&[16, 48], 2), var(&[48], 3));
     let w = Var::from_tensor(&(w.as_tensor() * 0.3).unwrap()).unwrap();

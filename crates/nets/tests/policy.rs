@@ -8,7 +8,7 @@ use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{RewardTarget, Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{Chooser, Evaluated, Input, Model, Policy};
+use magex_nets::executor::{Act, Chooser, Evaluated, Input, Model, Policy};
 use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params, to_safetensors};
@@ -46,7 +46,7 @@ impl Decoder {
 
 const IDENTITY: Activation = Activation::Identity;
 
-impl Policy for Decoder {
+impl Act for Decoder {
     fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>> {
         let rows = input.steps * input.sequences * input.agents;
         let mut actions = vec![0; rows];
@@ -58,7 +58,9 @@ impl Policy for Decoder {
         }
         Ok(None)
     }
+}
 
+impl Policy for Decoder {
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
         let both = ops::action_log_probs(&self.logits(input, actions)?, actions.to_vec(), &self.heads)?;
         Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: None })
@@ -201,7 +203,7 @@ fn a_loaded_policy_acts_as_the_one_that_was_written_and_evaluation_agrees_with_a
         let published: Vec<(&str, &Params)> = published.map(|(part, params)| (part.name, params)).collect();
         let loaded = model.load_policy(&to_safetensors(&published, "").unwrap()).unwrap();
         let flat = |states: Option<Tensor>| states.map(|s| s.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-        let act = |policy: &dyn Policy| {
+        let act = |policy: &dyn Act| {
             let mut sampler = Sampler::new(model.heads(), STATES, AGENTS, None);
             let states = policy.act(&input(&features, model.memory()), &mut sampler).unwrap();
             (sampler.actions, sampler.log_probs, flat(states))

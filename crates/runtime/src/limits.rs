@@ -81,6 +81,16 @@ pub fn memory() -> Option<(u64, &'static str)> {
     own.into_iter().flatten().min()
 }
 
+/// Memory that this process can still get, as far as the system says: what is available, within the limits.
+pub fn available_memory() -> Option<u64> {
+    let system = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let available = system
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:")?.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+    let limit = memory().map(|(limit, _)| limit);
+    available.map(|kib| kib << 10).into_iter().chain(limit).min()
+}
+
 /// A limit of the control group of this process, in either version of the interface.
 fn cgroup(name: &str, first_version: &str) -> Option<u64> {
     let own = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
@@ -104,7 +114,8 @@ pub fn explained(error: Error) -> Error {
     Error::new(error.kind(), text)
 }
 
-fn size(bytes: u64) -> String {
+/// Bytes in words.
+pub fn size(bytes: u64) -> String {
     if bytes >= 10 << 20 { format!("{} MiB", bytes >> 20) } else { format!("{} KiB", bytes >> 10) }
 }
 
@@ -119,6 +130,7 @@ mod tests {
         assert_eq!(error.code, USAGE);
         assert!(error.message.contains("ulimit -n") && error.message.contains("raise the limit"), "{error}");
         assert!(threads().contains("limit"));
+        assert!(available_memory().is_some_and(|bytes| bytes >= LEAST_MEMORY));
         let other = explained(Error::from(ErrorKind::StorageFull));
         assert_eq!(other.kind(), ErrorKind::StorageFull);
     }

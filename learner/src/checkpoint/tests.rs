@@ -1,6 +1,6 @@
 use super::*;
+use crate::train::algorithm::Algorithm;
 use crate::train::commander_ppo::CommanderPpo;
-use crate::train::mappo::Mappo;
 use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
@@ -12,7 +12,7 @@ fn learned() -> Learned {
         ..RunConfig::default()
     };
     let commander = CommanderPpo::new(&config.commander, &config.task, 1);
-    Learned::init(&Mappo::new(&config).unwrap(), &commander).unwrap()
+    Learned::init(&Algorithm::new(&config).unwrap(), &commander).unwrap()
 }
 
 fn progress(iteration: u32) -> Progress {
@@ -33,9 +33,9 @@ fn moved(mut learned: Learned) -> Learned {
         network.params.values[3] = 0.1 * steps as f32;
         network.params.values[0] = -7.25;
         network.params.values[1] = 1e-20;
-        network.adam.first[2] = 3e-9;
-        network.adam.second[1] = 1e-12;
-        network.adam.steps = steps;
+        network.moments.first[2] = 3e-9;
+        network.moments.second[1] = 1e-12;
+        network.moments.steps = steps;
     }
     learned.value_norm.update([0.3, 1.7].into_iter());
     learned
@@ -204,9 +204,9 @@ fn what_a_kill_left_half_written_is_removed_and_nothing_else() {
         fs::create_dir(checkpoints.join(name)).unwrap();
     }
     fs::write(checkpoints.join(".000013.tmp/weights.safetensors"), "half").unwrap();
-    clean(run.path());
+    clean(run.path(), 9);
     let left = |name: &str| checkpoints.join(name).exists();
     assert!(!left(".000013.tmp"));
     assert!(left("000012") && left(".000009.old") && left(".notes.tmp") && left("mine"));
-    clean(&run.path().join("nowhere"));
+    clean(&run.path().join("nowhere"), 9);
 }

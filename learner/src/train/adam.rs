@@ -1,31 +1,27 @@
 //! Adam (Kingma & Ba 2015) with global-norm clipping, on flat parameters. candle-nn's `AdamW` keeps its moments and its step
 //! counter private, so a checkpoint could not hold them, and takes one gradient store where ours are sums over slices.
 
-use serde::{Deserialize, Serialize};
-
-/// First and second moments of one network's gradient.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Adam {
-    /// m, one value per parameter.
-    pub first: Vec<f32>,
-    /// v, one value per parameter.
-    pub second: Vec<f32>,
-    /// Updates done.
-    pub steps: u64,
-}
+use crate::train::learned::Moments;
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 
-impl Adam {
-    /// Zero moments for `count` parameters.
-    pub fn new(count: usize) -> Self {
+impl Moments {
+    /// Those of Adam, zero, for `count` parameters.
+    pub fn adam(count: usize) -> Self {
         Self { first: vec![0.0; count], second: vec![0.0; count], steps: 0 }
     }
 
-    /// One update. The gradient is scaled down to `max_norm` if its L2 norm over all parameters, summed in order, is
+    /// One update by Adam. The gradient is scaled down to `max_norm` if its L2 norm over all parameters, summed in order, is
     /// larger. Returns the norm before clipping; a gradient that is not finite changes nothing and returns its norm.
-    pub fn step(&mut self, parameters: &mut [f32], gradient: &[f32], rate: f64, epsilon: f64, max_norm: f64) -> f64 {
+    pub fn adam_step(
+        &mut self,
+        parameters: &mut [f32],
+        gradient: &[f32],
+        rate: f64,
+        epsilon: f64,
+        max_norm: f64,
+    ) -> f64 {
         let norm = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt();
         if !norm.is_finite() {
             return norm;
@@ -53,11 +49,11 @@ mod tests {
 
     #[test]
     fn the_first_two_steps_match_hand_computed_values() {
-        let (mut adam, mut p) = (Adam::new(1), [1.0f32]);
-        adam.step(&mut p, &[0.5], 0.1, 1e-8, 10.0);
+        let (mut adam, mut p) = (Moments::adam(1), [1.0f32]);
+        adam.adam_step(&mut p, &[0.5], 0.1, 1e-8, 10.0);
         // The first step is the rate times the sign.
         assert!((p[0] - 0.9).abs() < 1e-6);
-        adam.step(&mut p, &[-0.25], 0.1, 1e-8, 10.0);
+        adam.adam_step(&mut p, &[-0.25], 0.1, 1e-8, 10.0);
         let m: f64 = (0.9 * 0.05 + 0.1 * -0.25) / (1.0 - 0.81);
         let v: f64 = (0.999 * 0.001 * 0.25 + 0.001 * 0.0625) / (1.0 - 0.999f64.powi(2));
         assert!((f64::from(p[0]) - (0.9 - 0.1 * m / v.sqrt())).abs() < 1e-5);
@@ -65,11 +61,11 @@ mod tests {
 
     #[test]
     fn clipping_scales_the_whole_gradient_and_bad_gradients_change_nothing() {
-        let (mut adam, mut p) = (Adam::new(2), [0.0f32; 2]);
-        assert_eq!(adam.step(&mut p, &[30.0, 40.0], 0.1, 1e-8, 10.0), 50.0);
+        let (mut adam, mut p) = (Moments::adam(2), [0.0f32; 2]);
+        assert_eq!(adam.adam_step(&mut p, &[30.0, 40.0], 0.1, 1e-8, 10.0), 50.0);
         assert!((adam.first[0] - 0.6).abs() < 1e-5 && (adam.first[1] - 0.8).abs() < 1e-5);
         let before = (adam.clone(), p);
-        assert!(adam.step(&mut p, &[f32::NAN, 0.0], 0.1, 1e-8, 10.0).is_nan());
+        assert!(adam.adam_step(&mut p, &[f32::NAN, 0.0], 0.1, 1e-8, 10.0).is_nan());
         assert_eq!((adam, p), before);
     }
 }

@@ -138,6 +138,11 @@ impl Slice<'_> {
     }
 }
 
+/// The numbers of a tensor, row-major.
+pub(crate) fn plain(tensor: &Tensor) -> CandleResult<Vec<f32>> {
+    tensor.flatten_all()?.to_vec1()
+}
+
 /// A vector without a gradient.
 pub(crate) fn column(values: Vec<f32>) -> CandleResult<Tensor> {
     let rows = values.len();

@@ -214,7 +214,7 @@ impl CommanderPpo {
         let gradient = network.params.gradient(variables, &loss.backward()?)?;
         let c = &self.config;
         let (rate, max_norm) = (c.learning_rate * rate_factor, c.max_grad_norm.into());
-        Ok(network.adam.step(&mut network.params.values, &gradient, rate, 1e-5, max_norm))
+        Ok(network.moments.adam_step(&mut network.params.values, &gradient, rate, 1e-5, max_norm))
     }
 
     /// Log-probabilities of every pick under the present weights.

@@ -1,8 +1,19 @@
 //! What learning changes: named networks with their optimisers, and the statistics of the value targets.
 
-use crate::train::adam::Adam;
 use crate::train::gae::ValueNorm;
+use crate::train::replay::Replay;
 use magex_nets::params::{ParamError, Params, to_safetensors};
+
+/// What an optimiser remembers of one network's gradients.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Moments {
+    /// Running mean, one value per parameter; empty for optimisers without one (RMSprop) and for networks without an optimiser.
+    pub first: Vec<f32>,
+    /// Running mean of the squares, one value per parameter; empty for networks without an optimiser.
+    pub second: Vec<f32>,
+    /// Updates done.
+    pub steps: u64,
+}
 
 /// One set of parameters with its optimiser.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,16 +22,16 @@ pub struct Network {
     pub name: String,
     /// The parameters; none for a scheduler that is not learned.
     pub params: Params,
-    /// Moments of their gradient.
-    pub adam: Adam,
+    /// State of the optimiser.
+    pub moments: Moments,
     /// Whether actors and commanders need it.
     pub published: bool,
 }
 
 impl Network {
-    /// With an optimiser that has done no step.
+    /// With an Adam that has done no step.
     pub fn new(name: &str, params: Params, published: bool) -> Self {
-        Self { name: name.to_owned(), adam: Adam::new(params.values.len()), params, published }
+        Self { name: name.to_owned(), moments: Moments::adam(params.values.len()), params, published }
     }
 }
 
@@ -31,6 +42,8 @@ pub struct Learned {
     pub networks: Vec<Network>,
     /// Running statistics of returns.
     pub value_norm: ValueNorm,
+    /// The replay buffer of an off-policy algorithm.
+    pub replay: Option<Replay>,
 }
 
 impl Learned {

@@ -162,7 +162,7 @@ impl Mappo {
                     let gradients = policy.iter().map(|(g, _)| &g[k]).chain(value.iter().map(|(g, _)| &g[k]));
                     let rate = if part.policy { m.actor_learning_rate } else { m.critic_learning_rate } * decay;
                     let (values, limit) = (&mut network.params.values, m.max_grad_norm.into());
-                    norms[k] = network.adam.step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit);
+                    norms[k] = network.moments.adam_step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit);
                 }
                 if norms.iter().any(|norm| !norm.is_finite()) {
                     total.skipped += 1.0;
@@ -398,12 +398,12 @@ fn normalise(advantages: &mut [f32]) {
 }
 
 /// The `index`-th of `parts` nearly equal consecutive ranges of 0..count.
-fn part(count: usize, parts: usize, index: usize) -> std::ops::Range<usize> {
+pub(crate) fn part(count: usize, parts: usize, index: usize) -> std::ops::Range<usize> {
     count * index / parts..count * (index + 1) / parts
 }
 
 /// Σ of the gradients, first slice first.
-fn sum_in_order<'a>(gradients: impl Iterator<Item = &'a Vec<f32>>) -> Vec<f32> {
+pub(crate) fn sum_in_order<'a>(gradients: impl Iterator<Item = &'a Vec<f32>>) -> Vec<f32> {
     let mut gradients = gradients.filter(|gradient| !gradient.is_empty());
     let mut total = gradients.next().cloned().unwrap_or_default();
     for gradient in gradients {
@@ -423,7 +423,7 @@ fn last_state(states: Option<&Tensor>, otherwise: Vec<f32>) -> CandleResult<Vec<
 }
 
 /// Σ in order, in double precision.
-fn sum(values: &Tensor) -> CandleResult<f64> {
+pub(crate) fn sum(values: &Tensor) -> CandleResult<f64> {
     Ok(values.to_vec1::<f32>()?.into_iter().map(f64::from).sum())
 }
 

@@ -74,6 +74,21 @@ pub enum TrainError {
     /// The configuration could not be serialised.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// A replay buffer that does not fit into memory.
+    #[error(
+        "qmix.buffer_episodes: {episodes} episodes take {}, and {} are available: lower it to {fit}",
+        magex_runtime::limits::size(*.needed), magex_runtime::limits::size(*.available)
+    )]
+    Buffer {
+        /// As it was requested.
+        episodes: usize,
+        /// Bytes that they take.
+        needed: u64,
+        /// Bytes that this process can get.
+        available: u64,
+        /// Episodes that take half of that.
+        fit: u64,
+    },
     /// The training threads could not be started.
     #[error("training threads cannot be started ({}); {}", .0, magex_runtime::limits::threads())]
     Threads(String),
@@ -87,6 +102,7 @@ impl TrainError {
             Self::OtherConfiguration(..)
                 | Self::Budget { .. }
                 | Self::Parent(..)
+                | Self::Buffer { .. }
                 | Self::NoParent(_)
                 | Self::Config(_)
                 | Self::Threads(_)

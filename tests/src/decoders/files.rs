@@ -9,9 +9,9 @@ use magex_core::sha256;
 use magex_core::trajectory::ShardResult;
 use magex_learner::checkpoint::{self, Progress};
 use magex_learner::serve::validate::{Limits, validate};
+use magex_learner::train::algorithm::Algorithm;
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
-use magex_learner::train::mappo::Mappo;
 use std::path::{Path, PathBuf};
 
 /// A run whose files are damaged.
@@ -32,9 +32,9 @@ impl Default for Run {
     fn default() -> Self {
         let config = small(ExecutorKind::Local, 3, 1);
         let toml = config.to_toml().expect("a configuration can be written");
-        let mappo = Mappo::new(&config).expect("a small network");
+        let algorithm = Algorithm::new(&config).expect("a small network");
         let commander = CommanderPpo::new(&config.commander, &config.task, 1);
-        let learned = Learned::init(&mappo, &commander).expect("small networks");
+        let learned = Learned::init(&algorithm, &commander).expect("small networks");
         let limits = Limits::for_task(&config.task, 4);
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress {

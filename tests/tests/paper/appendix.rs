@@ -6,8 +6,8 @@ use magex_core::config::{CommanderConfig, CommanderPolicy, ExecutorKind, MappoCo
 use magex_core::joint_state::JointState;
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
-use magex_learner::train::adam::Adam;
 use magex_learner::train::gae::ValueNorm;
+use magex_learner::train::learned::Moments;
 use magex_learner::train::mappo::Mappo;
 use magex_nets::commander::Commander;
 use magex_tests::small;
@@ -91,13 +91,13 @@ fn appendix_table_mappo_hyperparameters() {
     // Deviation: 3,000,000 steps; the default run needs a few thousand.
     assert_eq!(run.max_steps, 20_000);
     // Adam without weight decay: no gradient, no step.
-    let (mut adam, mut weights) = (Adam::new(2), [1.0f32, -3.0]);
-    adam.step(&mut weights, &[0.0, 0.0], 1e-3, 1e-5, 10.0);
+    let (mut adam, mut weights) = (Moments::adam(2), [1.0f32, -3.0]);
+    adam.adam_step(&mut weights, &[0.0, 0.0], 1e-3, 1e-5, 10.0);
     assert_eq!(weights, [1.0, -3.0]);
     // The gradient is clipped to a norm of 10: as far as it goes after one of 10 in the same direction.
     let steps = [[30.0f32, 40.0], [6.0, 8.0]].map(|gradient| {
-        let (mut adam, mut weights) = (Adam::new(2), [0.0f32; 2]);
-        adam.step(&mut weights, &gradient, 1e-3, 1.0, 10.0);
+        let (mut adam, mut weights) = (Moments::adam(2), [0.0f32; 2]);
+        adam.adam_step(&mut weights, &gradient, 1e-3, 1.0, 10.0);
         weights
     });
     assert!((steps[0][0] - steps[1][0]).abs() < 1e-9 && (steps[0][1] - steps[1][1]).abs() < 1e-9, "{steps:?}");

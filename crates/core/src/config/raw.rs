@@ -1,8 +1,8 @@
 //! The configuration as it is written: TOML in which nearly every key may be missing.
 
 use super::{
-    CollectConfig, CommanderConfig, ConfigError, EPISODES_MAX, ExecutorConfig, MappoConfig, RunConfig, RunSection,
-    Setting,
+    Algorithm, CollectConfig, CommanderConfig, ConfigError, EPISODES_MAX, ExecutorConfig, MappoConfig, MaserConfig,
+    QmixConfig, RunConfig, RunSection, Setting,
 };
 use crate::error::FieldError;
 use crate::task::{self, NOT_ZERO};
@@ -35,6 +35,8 @@ struct Sections {
     commander: Table,
     collect: Table,
     mappo: Table,
+    qmix: Table,
+    maser: Table,
 }
 
 /// `[collect]` as it is written.
@@ -72,6 +74,8 @@ pub(super) fn read(text: &str, settings: &[Setting]) -> Result<RunConfig, Config
         commander: toml_table::read("commander", sections.commander, CommanderConfig::bounds)?,
         collect: CollectConfig { episodes_per_iteration: 0, shards_per_iteration: collect.shards_per_iteration },
         mappo: toml_table::read("mappo", sections.mappo, MappoConfig::bounds)?,
+        qmix: toml_table::read("qmix", sections.qmix, QmixConfig::bounds)?,
+        maser: toml_table::read("maser", sections.maser, MaserConfig::bounds)?,
     };
     config.collect.episodes_per_iteration = match collect.episodes_per_iteration {
         Some(0) => return Err(FieldError::new("collect.episodes_per_iteration", NOT_ZERO).into()),
@@ -91,6 +95,11 @@ fn on_the_first_run(file: Table) -> Result<Table, ConfigError> {
     }
     if let Some(Value::Table(task)) = base.get_mut("task") {
         task.retain(|key, _| ["name", "agents", "spawn"].contains(&key));
+    }
+    // The first run's settings of MAPPO are none of another algorithm's.
+    let algorithm = file.get("run").and_then(|run| run.get("algorithm")).and_then(Value::as_str);
+    if algorithm.is_some_and(|name| name != Algorithm::Mappo.name()) {
+        base.remove("mappo");
     }
     for (name, section) in file {
         match (base.get_mut(&name), section) {

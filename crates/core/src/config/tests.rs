@@ -59,6 +59,68 @@ fn unknown_keys_and_bad_values_are_named() {
 }
 
 #[test]
+fn the_settings_of_another_algorithm_are_refused() {
+    let text = |algorithm: &str, more: &str| {
+        format!(
+            "run.algorithm = '{algorithm}'\nexecutor.kind = 'flat'\n\
+             task = {{ name = 'simple-spread', agents = 5, spawn = 'uniform', reward_target = 'team' }}\n{more}"
+        )
+    };
+    for (algorithm, more) in [
+        ("mappo", "mappo.gamma = 0.9"),
+        ("qmix", "qmix.gamma = 0.9"),
+        ("qmix", "mappo.gamma = 0.99"),
+        ("maser", "qmix.gamma = 0.9\nmaser.alpha = 0.1"),
+    ] {
+        let config = RunConfig::from_toml(&text(algorithm, more)).unwrap();
+        assert_eq!(RunConfig::from_toml(&config.to_toml().unwrap()).unwrap(), config, "{algorithm} {more}");
+    }
+    for (algorithm, more, problem) in [
+        (
+            "mappo",
+            "qmix.double_q = false",
+            "qmix.double_q: belongs to the algorithm qmix and maser; run.algorithm is mappo",
+        ),
+        (
+            "mappo",
+            "maser.alpha = 0.1",
+            "maser.alpha: belongs to the algorithm maser; run.algorithm is mappo; remove it",
+        ),
+        ("qmix", "maser.alpha = 0.1", "maser.alpha: belongs to the algorithm maser; run.algorithm is qmix; remove it"),
+        ("qmix", "mappo.epochs = 9", "mappo.epochs: belongs to the algorithm mappo; run.algorithm is qmix; remove it"),
+        (
+            "maser",
+            "mappo.epochs = 9",
+            "mappo.epochs: belongs to the algorithm mappo; run.algorithm is maser; remove it",
+        ),
+        ("qmix", "executor.centralised_critic = false", "executor.centralised_critic: belongs to the algorithm mappo"),
+        ("qmix", "qmix.batch_episodes = 5001", "qmix.batch_episodes: 5001 is more than qmix.buffer_episodes = 5000"),
+        ("qmix", "qmix.episodes_per_gradient_step = 7", "7 must divide collect.episodes_per_iteration = 40"),
+        ("dqn", "", "run.algorithm: \"dqn\" is unknown; use mappo"),
+    ] {
+        let error = RunConfig::from_toml(&text(algorithm, more)).unwrap_err().to_string();
+        assert!(error.contains(problem), "{algorithm} {more}: {error}");
+    }
+    let graph = text("qmix", "").replace("'flat'", "'magex'").replace(", reward_target = 'team'", "");
+    assert!(
+        RunConfig::from_toml(&graph)
+            .unwrap_err()
+            .to_string()
+            .contains("executor.kind: magex is not an executor of qmix")
+    );
+    // Without a task: the first run's settings of MAPPO are left out.
+    let config =
+        RunConfig::from_toml("run.algorithm = 'qmix'\nexecutor = { kind = 'flat', observes = 'goals' }").unwrap();
+    assert_eq!((config.mappo, config.task.agents), (MappoConfig::default(), 50));
+}
+
+#[test]
+fn exploration_falls_linearly_and_stays() {
+    let qmix = QmixConfig { epsilon_steps: 1000, ..QmixConfig::default() };
+    assert_eq!([0, 500, 1000, u64::MAX].map(|steps| qmix.epsilon(steps)), [1.0, 0.525, 0.05, 0.05]);
+}
+
+#[test]
 fn a_partial_task_takes_the_paper_sizes() {
     let config = RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 5\nspawn = 'uniform'").unwrap();
     assert_eq!((config.task.side, config.task.horizon), (2.0, 60));

@@ -8,7 +8,7 @@
 mod cache;
 
 use super::memory::Norm;
-use super::{Chooser, Evaluated, Input, Layer, Network, Output, Policy, RELU_GAIN};
+use super::{Act, Chooser, Evaluated, Input, Layer, Network, Output, Policy, RELU_GAIN};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
 use crate::ops::{Activation, Attention, action_log_probs, attention, constant, gelu, linear, with_values};
@@ -262,7 +262,7 @@ impl Mat {
     }
 }
 
-impl Policy for Mat {
+impl Act for Mat {
     fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> CandleResult<Option<Tensor>> {
         let encoded = self.encoder.forward(input)?;
         match &self.decoder {
@@ -275,7 +275,9 @@ impl Policy for Mat {
         }
         Ok(None)
     }
+}
 
+impl Policy for Mat {
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> CandleResult<Evaluated> {
         let encoded = self.encoder.forward(input)?;
         let features = match &self.decoder {

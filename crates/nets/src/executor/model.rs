@@ -1,11 +1,11 @@
 //! The networks of a run's executor.
 
 use super::mat::Mat;
-use super::{Independent, Network, Policy, build, feature_spec};
+use super::{Act, Distance, Independent, Mixer, Network, Policy, QNetwork, build, feature_spec};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
-use magex_core::config::{ExecutorConfig, ExecutorKind, RunConfig};
+use magex_core::config::{Algorithm, ExecutorKind, RunConfig};
 
 /// A named set of parameters with an optimiser of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -22,7 +22,7 @@ pub struct Part {
 /// share an encoder has one part that both read; rollout, update and checkpoint only follow this list.
 #[derive(Debug, Clone)]
 pub struct Model {
-    config: ExecutorConfig,
+    config: RunConfig,
     spec: FeatureSpec,
     heads: ActionHeads,
 }
@@ -34,6 +34,13 @@ const PARTS: [Part; 2] =
 /// Policy and value function share the encoder: one network, one optimiser.
 const WHOLE: [Part; 1] = [Part { name: "transformer", policy: true, value: true }];
 
+/// QMIX: one optimiser for both. Actors need the action values alone.
+const QMIX: [Part; 2] =
+    [Part { name: "agent", policy: true, value: false }, Part { name: "mixer", policy: false, value: true }];
+
+/// MASER has a distance between observations, too.
+const MASER: [Part; 3] = [QMIX[0], QMIX[1], Part { name: "distance", policy: false, value: false }];
+
 impl Model {
     /// The executor that a configuration names. `config.task` may have another team size than the weights were trained
     /// with, if the architecture allows it.
@@ -41,7 +48,7 @@ impl Model {
         let heads = ActionHeads::new(config.task.action_heads())
             .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))?;
         let spec = feature_spec(&config.executor, &config.task);
-        Ok(Self { config: config.executor.clone(), spec, heads })
+        Ok(Self { config: config.clone(), spec, heads })
     }
 
     /// What the networks see.
@@ -54,26 +61,41 @@ impl Model {
         &self.heads
     }
 
-    /// H: width of the memory of the policy and of that of the value function, 0 for none.
+    /// H: width of what a policy, or a value function, carries from step to step, 0 for nothing. Action values carry the last
+    /// action, too.
     pub fn memory(&self) -> usize {
-        self.config.memory()
+        let last_action = self.config.run.algorithm.off_policy() && self.config.qmix.last_action;
+        self.config.executor.memory() + if last_action { self.heads.logits() } else { 0 }
     }
 
     /// The sets of parameters.
     pub fn parts(&self) -> &'static [Part] {
-        if self.whole() { &WHOLE } else { &PARTS }
+        match self.config.run.algorithm {
+            Algorithm::Qmix => &QMIX,
+            Algorithm::Maser => &MASER,
+            Algorithm::Mappo if self.whole() => &WHOLE,
+            Algorithm::Mappo => &PARTS,
+        }
     }
 
     fn whole(&self) -> bool {
-        matches!(self.config.kind, ExecutorKind::Mat | ExecutorKind::MatDec)
+        matches!(self.config.executor.kind, ExecutorKind::Mat | ExecutorKind::MatDec)
     }
 
     /// Names, shapes and initial distributions of the parameters of every part.
     pub fn layouts(&self) -> Result<Vec<Vec<Entry>>, ParamError> {
         let mut builders: Vec<ParamBuilder> = self.parts().iter().map(|_| ParamBuilder::layout()).collect();
-        self.policy(&mut builders)?;
-        if !self.whole() {
-            self.value(&mut builders)?;
+        if self.config.run.algorithm.off_policy() {
+            self.q_network(&mut builders[0])?;
+            self.mixer(&mut builders[1])?;
+            if let Some(distance) = builders.get_mut(2) {
+                self.distance(distance)?;
+            }
+        } else {
+            self.policy(&mut builders)?;
+            if !self.whole() {
+                self.value(&mut builders)?;
+            }
         }
         Ok(builders.into_iter().map(ParamBuilder::entries).collect())
     }
@@ -81,23 +103,38 @@ impl Model {
     /// The policy on the given parameters, one builder per part.
     pub fn policy(&self, parts: &mut [ParamBuilder]) -> Result<Box<dyn Policy>, ParamError> {
         if self.whole() {
-            return Ok(Box::new(Mat::build(&self.config, &self.spec, &self.heads, &mut parts[0])?));
+            return Ok(Box::new(Mat::build(&self.config.executor, &self.spec, &self.heads, &mut parts[0])?));
         }
         let (heads, head) = (self.heads.clone(), (self.heads.logits(), 0.01));
-        let network = build(&self.config, &self.spec, head, false, &mut parts[0])?;
+        let network = build(&self.config.executor, &self.spec, head, false, &mut parts[0])?;
         Ok(Box::new(Independent { network, heads }))
     }
 
     /// The value function on the given parameters, one builder per part: one output per agent, in normalised units.
     pub fn value(&self, parts: &mut [ParamBuilder]) -> Result<Box<dyn Network>, ParamError> {
         if self.whole() {
-            return Ok(Box::new(Mat::build(&self.config, &self.spec, &self.heads, &mut parts[0])?));
+            return Ok(Box::new(Mat::build(&self.config.executor, &self.spec, &self.heads, &mut parts[0])?));
         }
-        build(&self.config, &self.spec, (1, 1.0), true, &mut parts[1])
+        build(&self.config.executor, &self.spec, (1, 1.0), true, &mut parts[1])
     }
 
-    /// The policy of a weights file.
-    pub fn load_policy(&self, weights: &[u8]) -> Result<Box<dyn Policy>, ParamError> {
+    /// The action values of QMIX.
+    pub fn q_network(&self, params: &mut ParamBuilder) -> Result<QNetwork, ParamError> {
+        QNetwork::build(&self.config, &self.spec, &self.heads, params)
+    }
+
+    /// The mixing network of QMIX.
+    pub fn mixer(&self, params: &mut ParamBuilder) -> Result<Mixer, ParamError> {
+        Mixer::build(&self.config, &self.spec, params)
+    }
+
+    /// The distance between observations of MASER.
+    pub fn distance(&self, params: &mut ParamBuilder) -> Result<Distance, ParamError> {
+        Distance::build(&self.config, &self.spec, &self.heads, params)
+    }
+
+    /// What acts, out of a weights file: the policy, or the action values.
+    pub fn load_policy(&self, weights: &[u8]) -> Result<Box<dyn Act>, ParamError> {
         let load = |(part, layout): (&Part, Vec<Entry>)| {
             Ok(match part.policy {
                 true => ParamBuilder::with(Params::load(layout, weights, part.name)?.tensors()?),
@@ -105,6 +142,10 @@ impl Model {
             })
         };
         let parts: Result<Vec<ParamBuilder>, ParamError> = self.parts().iter().zip(self.layouts()?).map(load).collect();
-        self.policy(&mut parts?)
+        let mut parts = parts?;
+        if self.config.run.algorithm.off_policy() {
+            return Ok(Box::new(self.q_network(&mut parts[0])?));
+        }
+        Ok(self.policy(&mut parts)?)
     }
 }

@@ -7,7 +7,7 @@ use candle_core::{Result, Tensor};
 
 /// Chooses actions: from a random stream, or the most likely one. It keeps what it chose.
 pub trait Chooser {
-    /// Chooses the action of one row of the batch, `[H]`, given its logits `[A]`. Every row is asked for once.
+    /// Chooses the action of one row of the batch, `[H]`, given its logits, or action values, `[A]`. Every row is asked for once.
     fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8];
 }
 
@@ -22,14 +22,17 @@ pub struct Evaluated {
     pub states: Option<Tensor>,
 }
 
-/// A policy of all agents. A row may depend on the actions of other rows of its joint state (decoding agent by agent):
-/// `act` shows the logits of a row to the chooser before it computes those of the next one, `evaluate` is given all actions.
-/// Both give the same log-probabilities for the same actions, to the bit: the first importance ratio is exactly 1.
-pub trait Policy: Send + Sync {
+/// What acts in a rollout: a policy, or action values. A row may depend on the actions of other rows of its joint state (decoding
+/// agent by agent): the logits of a row are shown to the chooser before those of the next one are computed.
+pub trait Act: Send + Sync {
     /// Chooses an action for every row of the batch. Returns the states of the memory after each step, [L, C·N, H]; `None`
     /// for networks without memory.
     fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>>;
+}
 
+/// A policy of all agents. `evaluate` is given all actions and gives the same log-probabilities for them as `act`, to the bit: the
+/// first importance ratio is exactly 1.
+pub trait Policy: Act {
     /// Evaluates the actions [R, H] of every row of the batch.
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated>;
 }
@@ -40,7 +43,7 @@ pub struct Independent {
     pub(super) heads: ActionHeads,
 }
 
-impl Policy for Independent {
+impl Act for Independent {
     fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>> {
         let output = self.network.forward(input)?;
         with_values(&output.out, |logits| {
@@ -50,7 +53,9 @@ impl Policy for Independent {
         })?;
         Ok(output.states)
     }
+}
 
+impl Policy for Independent {
     fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
         let output = self.network.forward(input)?;
         let both = action_log_probs(&output.out, actions.to_vec(), &self.heads)?;

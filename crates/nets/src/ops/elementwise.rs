@@ -13,6 +13,11 @@ pub fn tanh(x: &Tensor) -> Result<Tensor> {
     apply1(Elementwise::Tanh, x)
 }
 
+/// Exponential linear unit: x above zero, eˣ − 1 elsewhere.
+pub fn elu(x: &Tensor) -> Result<Tensor> {
+    apply1(Elementwise::Elu, x)
+}
+
 /// Gaussian error linear unit in its hyperbolic form (Hendrycks & Gimpel 2016): x/2 · (1 + tanh(√(2/π) (x + 0.044715 x³))),
 /// within 5e-4 of x Φ(x).
 pub fn gelu(x: &Tensor) -> Result<Tensor> {
@@ -29,6 +34,7 @@ pub fn softmax(x: &Tensor) -> Result<Tensor> {
 enum Elementwise {
     Exp,
     Tanh,
+    Elu,
 }
 
 impl Operation<1> for Elementwise {
@@ -37,11 +43,14 @@ impl Operation<1> for Elementwise {
     fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
         let mut y = vec![0.0; x.values.len()];
         let f = match self {
-            Self::Exp => f32x16::exp,
+            Self::Exp | Self::Elu => f32x16::exp,
             Self::Tanh => simd::tanh,
         };
         for (x, y) in x.values.chunks(LANES).zip(y.chunks_mut(LANES)) {
             store(f(load(x)), y);
+        }
+        if matches!(self, Self::Elu) {
+            y.iter_mut().zip(x.values).for_each(|(y, &x)| *y = if x > 0.0 { x } else { *y - 1.0 });
         }
         Ok((y, Shape::from(x.dims)))
     }
@@ -50,6 +59,7 @@ impl Operation<1> for Elementwise {
         let dx = y.iter().zip(dy).map(|(y, d)| match self {
             Self::Exp => d * y,
             Self::Tanh => d * (1.0 - y * y),
+            Self::Elu => d * if *y > 0.0 { 1.0 } else { y + 1.0 },
         });
         Ok([Some(dx.collect())])
     }
