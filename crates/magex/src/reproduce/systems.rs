@@ -92,6 +92,8 @@ const MAT_DEC: &str = include_str!("../../../../deploy/configs/baselines/mat-dec
 const MAT_GOALS: &str = include_str!("../../../../deploy/configs/baselines/mat-goals.toml");
 const DICG: &str = include_str!("../../../../deploy/configs/baselines/dicg.toml");
 const DICG_FROZEN: &str = include_str!("../../../../deploy/configs/baselines/dicg-frozen.toml");
+const QMIX: &str = include_str!("../../../../deploy/configs/baselines/qmix.toml");
+const MASER: &str = include_str!("../../../../deploy/configs/baselines/maser.toml");
 const DICG_GOALS: &str = include_str!("../../../../deploy/configs/baselines/dicg-goals.toml");
 
 /// A large team's iteration has as many agent samples in fewer episodes, and its minibatches are larger.
@@ -127,6 +129,8 @@ pub(crate) const TABLES: &[PaperTable] = &[
             baseline("MAPPO", "mappo", &[MAPPO], &[success(0.82, 0.03), success(0.50, 0.31), success(0.13, 0.02)]),
             baseline("MAT", "mat", &[MAT], &[success(1.00, 0.01), success(0.56, 0.26), success(0.11, 0.01)]),
             baseline("DICG", "dicg", &[DICG], &[success(0.71, 0.05), success(0.41, 0.04), success(0.12, 0.02)]),
+            learner("MASER", "maser", &[MASER], &[], &[success(0.06, 0.12), success(0.02, 0.23), success(0.01, 0.05)]),
+            learner("QMIX", "qmix", &[QMIX], &[], &[]),
             baseline("MAPPO, GRU", "mappo-rnn", &[MAPPO_RNN], &[]),
             baseline("IPPO", "ippo", &[IPPO], &[]),
             baseline("MAT-Dec", "mat-dec", &[MAT_DEC], &[]),
@@ -148,6 +152,7 @@ pub(crate) const TABLES: &[PaperTable] = &[
             baseline("MAPPO", "mappo", &[MAPPO], &[success(0.20, 0.01), success(0.26, 0.01)]),
             baseline("MAT", "mat", &[MAT], &[success(0.32, 0.04), success(0.25, 0.02)]),
             baseline("DICG", "dicg", &[DICG], &[success(0.20, 0.01), success(0.36, 0.01)]),
+            learner("MASER", "maser", &[MASER], &[], &[success(0.01, 0.01), success(0.01, 0.01)]),
             controller("scripted", "scripted", Controller::Scripted, &[]),
             controller("nearest ball", "nearest", Controller::Nearest, &[]),
             controller("random actions", "random", Controller::Random, &[]),
