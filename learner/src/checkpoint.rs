@@ -3,7 +3,7 @@
 //! A checkpoint is a folder `checkpoints/<iteration>` with `weights.safetensors` (every network of [`Learned`]),
 //! `optimiser.safetensors` (what their optimisers remember), `state.json` (counters, value statistics) and, written last, `manifest.json`
 //! with the SHA-256 of each. It is written under a temporary name, flushed to disk, and renamed. Of a replay buffer it has the
-//! hashes: the episodes are in files of their own, which checkpoints share ([`replay`]).
+//! hashes: the episodes are in files of their own, which checkpoints share (`checkpoint/replay.rs`).
 
 pub mod disk;
 mod replay;
