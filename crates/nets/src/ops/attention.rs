@@ -20,7 +20,7 @@ pub struct Attention {
 /// y [S·N, F], y_i = Σ_j softmax_j(scale · q_i·k_j) v_j, head by head, for q, k, v [S·N, F].
 ///
 /// The bits of y_i depend on q_i and on the keys and values that agent i sees, in their order, and on nothing else: decoding agent by
-/// agent ([`attend`]) and evaluating all agents at once give the same log-probabilities.
+/// agent (`attend`) and evaluating all agents at once give the same log-probabilities.
 pub fn attention(q: &Tensor, k: &Tensor, v: &Tensor, shape: Attention) -> Result<Tensor> {
     apply3(Op { shape, weights: OnceLock::new() }, [q, &k.contiguous()?, &v.contiguous()?])
 }
