@@ -273,6 +273,13 @@ impl RunConfig {
         raw::read(text, settings)?.validated()
     }
 
+    /// Reads what another format than TOML holds, such as the JSON of an earlier build: keys that it does not have take their
+    /// defaults, as in a file.
+    pub fn from_keys(keys: &impl Serialize) -> Result<Self, ConfigError> {
+        let table = toml::Table::try_from(keys).map_err(|error| ConfigError(error.to_string()))?;
+        Self::from_toml(&table.to_string())
+    }
+
     /// The same configuration if every value is in its range.
     pub fn validated(self) -> Result<Self, ConfigError> {
         self.check_ranges()?;

@@ -15,13 +15,12 @@ const PLAIN: &str = "
 ";
 
 /// Words of the past: (word, what to say instead).
-const OLD: [(&str, &str); 12] = [
+const OLD: [(&str, &str); 11] = [
     ("bound", "bottleneck"),
     ("crew", "rollout pool"),
     ("divergence", "approx_kl"),
     ("extras", "agent_state"),
     ("gone", "cancelled"),
-    ("heads", "action_components"),
     ("incarnation", "process_id"),
     ("leash", "parent watch"),
     ("share", "fraction"),

@@ -184,3 +184,20 @@ fn a_setting_of_another_executor_is_refused_and_so_is_a_reward_for_goals_that_ar
     let sighted = RunConfig::from_toml(&format!("{task}[executor]\nkind = 'flat'\nobserves = 'goals'")).unwrap();
     assert!(sighted.executor.kind.fixed_team_size());
 }
+
+#[test]
+fn keys_of_another_format_are_read_and_newer_ones_take_their_defaults() {
+    let config =
+        RunConfig::from_toml("[task]\nname = 'push-ball'\nagents = 5\nspawn = 'uniform'\n[mappo]\ngamma = 0.9")
+            .unwrap();
+    let written = serde_json::to_string(&config).unwrap();
+    let mut keys: serde_json::Value = serde_json::from_str(&written).unwrap();
+    assert_eq!(RunConfig::from_keys(&keys).unwrap(), config);
+    for (section, key) in [("run", "algorithm"), ("executor", "frozen_graph"), ("mappo", "joint_ratio")] {
+        keys[section].as_object_mut().unwrap().remove(key).unwrap();
+    }
+    keys.as_object_mut().unwrap().remove("qmix").unwrap();
+    assert_eq!(RunConfig::from_keys(&keys).unwrap(), config);
+    keys["mappo"]["alpha"] = 1.into();
+    assert!(RunConfig::from_keys(&keys).unwrap_err().to_string().contains("mappo.alpha"));
+}

@@ -5,6 +5,7 @@ use crate::artifacts;
 use crate::runs::SeedRun;
 use crate::settings;
 use anyhow::Context as _;
+use magex_core::config::RunConfig;
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, METRICS, SUCCESS_RATE, as_written,
 };
@@ -136,8 +137,13 @@ pub(crate) fn write(path: &Path, record: &Record) -> anyhow::Result<()> {
 
 impl Record {
     /// Keys whose values differ from those that are asked for, with both values.
-    pub(crate) fn differs(&self, config: &magex_core::config::RunConfig) -> anyhow::Result<Vec<String>> {
-        Ok(settings::changes(&settings::flat_value(&self.config), &settings::flat(config)?))
+    pub(crate) fn differs(&self, config: &RunConfig) -> anyhow::Result<Vec<String>> {
+        // With keys that are newer than the record.
+        let own = match RunConfig::from_keys(&self.config) {
+            Ok(own) => settings::flat(&own)?,
+            Err(_) => settings::flat_value(&self.config),
+        };
+        Ok(settings::changes(&own, &settings::flat(config)?))
     }
 
     /// The same measurement as a cell of another table.
