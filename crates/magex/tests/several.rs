@@ -208,11 +208,11 @@ fn runs_are_compared_by_settings_success_and_curves() {
 /// A record without what depends on the clock.
 fn record(place: &Place, name: &str) -> Value {
     let mut value: Value = serde_json::from_str(&place.read(name)).unwrap();
-    value["wall_s"] = Value::Null;
+    (value["wall_s"], value["planning_ms"]) = (Value::Null, Value::Null);
     value
 }
 
-const REPRODUCE: &str = "reproduce --budget smoke --table push-ball,planner --max-steps 24000 --episodes 4 --threads 1";
+const REPRODUCE: &str = "reproduce --budget smoke --table push-ball,planner --systems mage-x,scripted,astar --max-steps 24000 --episodes 4 --threads 1";
 
 #[test]
 fn tables_are_reproduced_interrupted_and_made_again_without_training() {
@@ -223,7 +223,7 @@ fn tables_are_reproduced_interrupted_and_made_again_without_training() {
     let said = place.says(&line);
     narrow(&said);
     place.says(&format!("{REPRODUCE} --out whole"));
-    for name in ["push-ball/mage-x-5-seed-1.json", "planner/mage-x-5-seed-1.json", "planner/scripted-5-seed-1.json"] {
+    for name in ["push-ball/mage-x-5-seed-1.json", "planner/mage-x-5-seed-1.json", "planner/astar-5-seed-1.json"] {
         let (own, other) =
             (record(&place, &format!("cut/results/{name}")), record(&place, &format!("whole/results/{name}")));
         assert_eq!(own, other, "{name}: an interruption changes nothing");
@@ -268,12 +268,12 @@ fn tables_are_reproduced_interrupted_and_made_again_without_training() {
 #[test]
 fn runs_have_the_layout_of_marl_eval() {
     let place = Place::new();
-    place.says("reproduce --budget smoke --table drones,planner --max-steps 240 --episodes 3 --seeds 1,2 --out out");
+    place.says("reproduce --budget smoke --table drones,planner --systems mage-x,scripted,astar --max-steps 240 --episodes 3 --seeds 1,2 --out out");
     let runs: Value = serde_json::from_str(&place.read("out/runs.json")).unwrap();
     let object = |value: &Value| value.as_object().unwrap().clone();
     assert_eq!(object(&runs).keys().collect::<Vec<_>>(), ["drones", "planner"]);
     assert_eq!(object(&runs["drones"]).keys().collect::<Vec<_>>(), ["n_2", "n_4"]);
-    assert_eq!(object(&runs["planner"]["n_5"]).keys().collect::<Vec<_>>(), ["mage_x", "scripted"]);
+    assert_eq!(object(&runs["planner"]["n_5"]).keys().collect::<Vec<_>>(), ["astar", "mage_x", "scripted"]);
     for (environment, task, metrics) in [("drones", "n_4", 2), ("planner", "n_5", 1)] {
         let mut counts = Vec::new();
         for (name, algorithm) in object(&runs[environment][task]) {
@@ -316,7 +316,7 @@ fn wall_time_ends_a_training_and_is_told() {
 #[test]
 fn ctrl_c_stops_a_reproduction_and_the_same_command_continues() {
     let place = Place::new();
-    let line = "reproduce --budget smoke --table spread --max-steps 1e9 --episodes 2 --max-minutes 0.1 --out out";
+    let line = "reproduce --budget smoke --table spread --systems mage-x,mappo --max-steps 1e9 --episodes 2 --max-minutes 0.1 --out out";
     let mut child = place.command(line).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     place.wait_for("out/runs/spread/mage-x-5/seed-1/metrics.jsonl", &mut child);
     assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());

@@ -30,13 +30,13 @@ fn paper([mean, deviation]: [f64; 2]) -> String {
     format!("{mean:.2} ({deviation:.2})")
 }
 
-/// What is printed: a row per cell, in 80 columns.
+/// What is printed: a row per cell, in 80 columns. A system has the name that `--systems` takes.
 pub(crate) fn printed(measured: &[Measured]) -> Table {
     let mut table = Table::new(2, &["table", "system", "N", "greedy", "sampled", "paper", "steps", "ended by"]);
     for one in measured {
         table.row(vec![
             one.cell.table.name.into(),
-            one.cell.system.name.into(),
+            one.cell.system.id.into(),
             one.cell.agents().to_string(),
             optional(one.greedy().map(|value| share(value.mean))),
             optional(one.sampled().map(|value| share(value.mean))),
