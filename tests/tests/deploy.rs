@@ -74,11 +74,18 @@ fn every_setting_of_the_compose_files_has_a_default() {
 #[test]
 fn every_configuration_can_be_run() {
     let mut files = vec![deploy().join("k8s/base/run.toml"), deploy().join("k8s/overlays/example/run.toml")];
-    files.extend(fs::read_dir(deploy().join("configs")).unwrap().map(|entry| entry.unwrap().path()));
-    assert!(files.len() > 8);
+    for folder in ["configs", "configs/baselines"] {
+        let entries = fs::read_dir(deploy().join(folder)).unwrap().map(|entry| entry.unwrap().path());
+        files.extend(entries.filter(|path| path.is_file()));
+    }
+    assert!(files.len() > 20);
     for file in files {
         let text = fs::read_to_string(&file).unwrap();
         RunConfig::from_toml(&text).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+        // A baseline says where its settings are explained.
+        if let Some(page) = text.lines().find_map(|line| line.strip_prefix("# docs/")) {
+            assert!(deploy().parent().unwrap().join("docs").join(page).is_file(), "{}: {page}", file.display());
+        }
     }
 }
 

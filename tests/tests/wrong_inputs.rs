@@ -256,7 +256,7 @@ fn by_hand() -> Vec<Row> {
         ("train --seed 9223372036854775808", 64, &["--seed", "0 to 9223372036854775807"]),
         ("train --max-steps 99999999999999999999", 64, &["--max-steps", "1 to 1000000000000"]),
         ("train --set run.seed", 64, &["--set", "KEY=VALUE"]),
-        ("train --set run.sed=1 --print-config", 64, &["--set", "run.sed", "use seed"]),
+        ("train --set run.sed=1 --print-config", 64, &["--set", "run.sed", "use algorithm, seed"]),
         ("train --set run.seed=five --print-config", 64, &["--set", "run.seed", "a whole number"]),
         ("train {f}/ring.toml --set run.seed=1", 64, &["ring.toml", "task.spawn"]),
         ("train --seeds 1,2 --seed 3", 64, &["--seeds", "--seed", "leave one out"]),
