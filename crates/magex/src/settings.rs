@@ -52,11 +52,9 @@ impl Overrides {
         let text = path.map_or_else(|| Ok(String::new()), |path| options::text_file("", path))?;
         let file = || path.map_or_else(String::new, |path| path.display().to_string());
         RunConfig::from_toml_with(&text, &self.settings).map_err(|error| {
-            // A file that is refused without them is at fault itself.
-            match RunConfig::from_toml(&text) {
-                Ok(_) => anyhow::Error::new(error).context(SET),
-                Err(error) => anyhow::Error::new(error).context(file()),
-            }
+            // The file is at fault itself if it is refused without them in the same words.
+            let alone = RunConfig::from_toml(&text).err().is_some_and(|alone| alone.0 == error.0);
+            anyhow::Error::new(error).context(if alone { file() } else { SET.to_owned() })
         })
     }
 

@@ -128,6 +128,16 @@ fn a_setting_wins_over_the_file_and_an_option_over_the_setting() {
     assert!(more["joint_env_steps"].as_u64() > first["joint_env_steps"].as_u64());
     place.fails("train --resume --out run --in-process --http off --set mappo.gamma=0.6", 64, &["mappo.gamma"]);
     place.fails("train --set mappo.gama=1 --out x", 64, &["--set", "mappo.gama", "unknown key", "gamma"]);
+    // What is wrong with the settings is told, though the file alone would be wrong, too.
+    fs::write(place.path("half.toml"), "[executor]\nkind = 'flat'\n[mappo]\nepochs = 2").unwrap();
+    place.fails("train half.toml --out x", 64, &["half.toml", "task.reward_target"]);
+    let set = "--set task.reward_target=team --set executor.recurrent=true --set run.algorithm=qmix";
+    place.fails(
+        &format!("train half.toml --out x {set}"),
+        64,
+        &["--set", "mappo.epochs", "belongs to the algorithm mappo"],
+    );
+    place.fails("train half.toml --out x --set mappo.gamma=0.5", 64, &["half.toml", "task.reward_target"]);
     assert!(!place.path("x").exists());
 }
 

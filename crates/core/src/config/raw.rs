@@ -61,7 +61,7 @@ fn collect_bounds(_key: &str) -> Option<String> {
 /// checked.
 pub(super) fn read(text: &str, settings: &[Setting]) -> Result<RunConfig, ConfigError> {
     let file: Table = toml::from_str(text).map_err(|error| not_toml(text, &error))?;
-    let mut file = if file.contains_key("task") { file } else { on_the_first_run(file)? };
+    let mut file = if file.contains_key("task") { file } else { on_the_first_run(file, settings)? };
     settings.iter().try_for_each(|setting| setting.apply(&mut file))?;
     refuse_renamed(&file)?;
     let sections: Sections = toml_table::read("", file, |_| None)?;
@@ -86,7 +86,7 @@ pub(super) fn read(text: &str, settings: &[Setting]) -> Result<RunConfig, Config
 }
 
 /// A file without a task changes keys of the first run.
-fn on_the_first_run(file: Table) -> Result<Table, ConfigError> {
+fn on_the_first_run(file: Table, settings: &[Setting]) -> Result<Table, ConfigError> {
     let text = RunConfig::default().to_toml()?;
     let mut base: Table = toml::from_str(&text).map_err(|error| ConfigError(error.to_string()))?;
     // Derived, also from what the file and the settings say.
@@ -97,7 +97,9 @@ fn on_the_first_run(file: Table) -> Result<Table, ConfigError> {
         task.retain(|key, _| ["name", "agents", "spawn"].contains(&key));
     }
     // The first run's settings of MAPPO are none of another algorithm's.
-    let algorithm = file.get("run").and_then(|run| run.get("algorithm")).and_then(Value::as_str);
+    let mut asked = file.clone();
+    settings.iter().try_for_each(|setting| setting.apply(&mut asked))?;
+    let algorithm = asked.get("run").and_then(|run| run.get("algorithm")).and_then(Value::as_str);
     if algorithm.is_some_and(|name| name != Algorithm::Mappo.name()) {
         base.remove("mappo");
     }

@@ -13,6 +13,13 @@ fn an_empty_file_is_the_first_run_and_one_without_a_task_changes_it() {
     let mut expected = config;
     (expected.run.seed, expected.collect) = (7, CollectConfig { episodes_per_iteration: 6, shards_per_iteration: 6 });
     assert_eq!(changed, expected);
+    let other = RunConfig::from_toml(
+        "[run]\nalgorithm = 'qmix'\n[task]\nname = 'simple-spread'\nagents = 50\nspawn = 'lines'\n\
+                                      reward_target = 'team'\n[executor]\nkind = 'flat'\nrecurrent = true",
+    );
+    assert!(other.is_ok(), "{other:?}");
+    let error = RunConfig::from_toml("[run]\nalgorithm = 'qmix'").unwrap_err().to_string();
+    assert!(!error.contains("mappo."), "keys that the file does not set are not at fault: {error}");
     // With a task, the documented defaults.
     let other = RunConfig::from_toml("[task]\nname = 'simple-spread'\nagents = 50\nspawn = 'lines'").unwrap();
     assert_eq!((other.run, other.mappo), (RunSection::default(), MappoConfig::default()));
