@@ -70,6 +70,20 @@ impl Table {
     pub fn row(&mut self, cells: Vec<String>) {
         self.rows.push(cells);
     }
+
+    /// The same table if it fits into so many columns, or else turned: its columns are rows, where that is narrower.
+    pub fn within(self, columns: usize) -> Self {
+        let width = |table: &Self| table.to_string().lines().map(|line| line.chars().count()).max().unwrap_or(0);
+        let own = width(&self);
+        if own <= columns {
+            return self;
+        }
+        let rows = self.rows.iter().map(Vec::len).max().unwrap_or(0);
+        let cell = |row: &Vec<String>, k: usize| row.get(k).cloned().unwrap_or_default();
+        let turned = (0..rows).map(|k| self.rows.iter().map(|row| cell(row, k)).collect()).collect();
+        let turned = Self { left: 1, rows: turned };
+        if width(&turned) < own { turned } else { self }
+    }
 }
 
 impl std::fmt::Display for Table {
@@ -138,5 +152,11 @@ mod tests {
         table.row(vec!["a".into(), "1.25".into()]);
         table.row(vec!["longer".into(), "10.25".into()]);
         assert_eq!(table.to_string(), "  name     value\n  a         1.25\n  longer   10.25");
+        assert_eq!(table.clone().within(80).to_string(), table.to_string());
+        // Turned it would be wider still.
+        assert_eq!(table.clone().within(10).to_string(), table.to_string());
+        let mut wide = Table::new(1, &["name", "first", "second"]);
+        wide.row(vec!["a".into(), "1".into(), "20".into()]);
+        assert_eq!(wide.within(20).to_string(), "  name      a\n  first     1\n  second   20");
     }
 }

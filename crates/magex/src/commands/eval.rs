@@ -163,7 +163,7 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         }
         means.insert(mode_name(mode).into(), mean);
     }
-    output.say(table.to_string());
+    output.say(table.within(80).to_string());
     note(format!("{} with {threads} threads", seconds(rows.iter().map(|row| row.wall_s).sum())));
     output.result(&json!({
         "run": args.subject.run,
