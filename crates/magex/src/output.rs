@@ -71,7 +71,7 @@ impl Table {
         self.rows.push(cells);
     }
 
-    /// The same table if it fits into so many columns, or else turned: its columns are rows, where that is narrower.
+    /// The same table if it fits into a number of columns, or else turned: its columns are rows, where that is narrower.
     pub fn within(self, columns: usize) -> Self {
         let width = |table: &Self| table.to_string().lines().map(|line| line.chars().count()).max().unwrap_or(0);
         let own = width(&self);
