@@ -32,6 +32,15 @@ impl ActionHeads {
         &self.sizes
     }
 
+    /// Sets the ones of an action [H] in a row of zeros [A].
+    pub fn mark(&self, action: &[u8], row: &mut [f32]) {
+        let mut at = 0;
+        for (&choice, &size) in action.iter().zip(&self.sizes) {
+            row[at + usize::from(choice)] = 1.0;
+            at += size;
+        }
+    }
+
     /// Log-probabilities of every choice, component by component.
     #[inline]
     pub fn log_softmax(&self, logits: &[f32], out: &mut [f32]) {

@@ -7,7 +7,7 @@ use magex_core::rng::sequence;
 use magex_core::trajectory::{Shape, Trajectory};
 use magex_nets::executor::Input;
 use magex_nets::features::{FeatureSpec, Features};
-use magex_nets::ops::GraphNoise;
+use magex_nets::ops::{self, GraphNoise};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -141,6 +141,13 @@ impl Slice<'_> {
 /// The numbers of a tensor, row-major.
 pub(crate) fn plain(tensor: &Tensor) -> CandleResult<Vec<f32>> {
     tensor.flatten_all()?.to_vec1()
+}
+
+/// Σ over the columns of each row: [R, A] → `[R]`.
+pub(crate) fn sum_of_rows(x: &Tensor) -> CandleResult<Tensor> {
+    // A product with ones: candle's sum has another order on another instruction set.
+    let (ones, zero) = (ops::constant(vec![1.0; x.dim(1)?], 1)?, column(vec![0.0])?);
+    ops::linear(x, &ones, &zero, ops::Activation::Identity, false)?.flatten_all()
 }
 
 /// A vector without a gradient.

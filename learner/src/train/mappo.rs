@@ -17,7 +17,7 @@
 //! | 12 | a minibatch is cut into a fixed number of slices whose gradients are added in their order | ours: the number of threads does not reach a number |
 //! | 13 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
-use crate::train::batch::{Batch, Slice, column};
+use crate::train::batch::{Batch, Slice, column, sum_of_rows};
 use crate::train::gae::{Gae, ValueNorm};
 use crate::train::learned::{Learned, Network};
 use crate::train::stats::UpdateStats;
@@ -227,9 +227,10 @@ impl Mappo {
         let log_ratio = (now.log_probs - slice.column(&slice.batch.log_probs)?)?;
         let (log_ratio, advantages, entropies, agents) = if m.joint_ratio {
             let agents = slice.batch.shape.agents;
-            let mean = |x: &Tensor| sum_of_agents(x, agents)? / agents as f64;
+            let sum = |x: &Tensor| sum_of_rows(&x.reshape(((), agents))?);
+            let mean = |x: &Tensor| sum(x)? / agents as f64;
             let (advantages, entropies) = (mean(&slice.column(advantages)?)?, mean(&now.entropies)?);
-            (sum_of_agents(&log_ratio, agents)?, advantages, entropies, agents)
+            (sum(&log_ratio)?, advantages, entropies, agents)
         } else {
             (log_ratio, slice.column(advantages)?, now.entropies, 1)
         };
@@ -279,13 +280,6 @@ impl Mappo {
         let builders = variables.iter().map(builder).collect();
         Ok((variables, builders))
     }
-}
-
-/// Σ over the N agents of each joint state: `[S·N]` → `[S]`.
-fn sum_of_agents(x: &Tensor, agents: usize) -> CandleResult<Tensor> {
-    // A product with ones: candle's sum has another order on another instruction set.
-    let (ones, zero) = (ops::constant(vec![1.0; agents], 1)?, column(vec![0.0])?);
-    ops::linear(&x.reshape(((), agents))?, &ones, &zero, ops::Activation::Identity, false)?.flatten_all()
 }
 
 /// min(ρ A, clip(ρ, 1 ± ε) A), element by element.

@@ -17,13 +17,13 @@
 //!
 //! MASER adds its intrinsic reward to the reward and its losses to the loss: [`maser`].
 
-use crate::train::batch::{column, plain};
+use crate::train::batch::{column, plain, sum_of_rows};
 use crate::train::learned::{Learned, Moments, Network};
 use crate::train::mappo::{part, sum, sum_in_order};
 use crate::train::maser::{self, MaserSums, Subgoals};
 use crate::train::replay::{Episodes, Replay};
 use crate::train::stats::UpdateStats;
-use candle_core::{Result as CandleResult, Tensor, Var};
+use candle_core::{Result as CandleResult, Var};
 use magex_core::config::{Algorithm, RunConfig};
 use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose};
@@ -238,13 +238,6 @@ impl Qmix {
         let flat = |(network, variables): (&Network, &Vec<Var>)| Ok(network.params.gradient(variables, &store)?);
         Ok((trained.iter().zip(&variables).map(flat).collect::<Result<Gradients>>()?, sums))
     }
-}
-
-/// Σ over the columns of each row: [R, A] → `[R]`.
-fn sum_of_rows(x: &Tensor) -> CandleResult<Tensor> {
-    // A product with ones: candle's sum has another order on another instruction set.
-    let (ones, zero) = (ops::constant(vec![1.0; x.dim(1)?], 1)?, column(vec![0.0])?);
-    ops::linear(x, &ones, &zero, ops::Activation::Identity, false)?.flatten_all()
 }
 
 /// Sums over the joint steps of a batch, or of one of its slices, in order and in double precision.

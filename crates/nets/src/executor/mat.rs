@@ -246,19 +246,10 @@ impl Mat {
         for (row, token) in tokens.chunks_exact_mut(width).enumerate() {
             match row % agents {
                 0 => token[0] = 1.0,
-                _ => self.mark(&actions[(row - 1) * components..row * components], token),
+                _ => self.heads.mark(&actions[(row - 1) * components..row * components], &mut token[1..]),
             }
         }
         constant(tokens, width)
-    }
-
-    /// Sets the ones of an action's components in a token of zeros.
-    fn mark(&self, action: &[u8], token: &mut [f32]) {
-        let mut at = 1;
-        for (&choice, &size) in action.iter().zip(self.heads.sizes()) {
-            token[at + usize::from(choice)] = 1.0;
-            at += size;
-        }
     }
 }
 

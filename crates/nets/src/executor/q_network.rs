@@ -34,11 +34,7 @@ enum Second {
 pub fn one_hot(actions: &[u8], heads: &ActionHeads) -> Vec<f32> {
     let mut out = vec![0.0; actions.len() / heads.count() * heads.logits()];
     for (row, action) in out.chunks_exact_mut(heads.logits()).zip(actions.chunks_exact(heads.count())) {
-        let mut at = 0;
-        for (&choice, &size) in action.iter().zip(heads.sizes()) {
-            row[at + usize::from(choice)] = 1.0;
-            at += size;
-        }
+        heads.mark(action, row);
     }
     out
 }

@@ -209,7 +209,7 @@ impl<'a> Cache<'a> {
             tokens.fill(0.0);
             for (c, logits) in logits.chunks_exact(self.mat.heads.logits()).enumerate() {
                 action.copy_from_slice(choose.choose(c * agents + i, logits));
-                self.mat.mark(&action, &mut tokens[c * token_width..(c + 1) * token_width]);
+                self.mat.heads.mark(&action, &mut tokens[c * token_width + 1..(c + 1) * token_width]);
             }
         }
         Ok(())
