@@ -32,7 +32,7 @@ impl ActionHeads {
         &self.sizes
     }
 
-    /// Sets the ones of an action [H] in a row of zeros [A].
+    /// Sets the ones of an action `[H]` in a row of zeros `[A]`.
     pub fn mark(&self, action: &[u8], row: &mut [f32]) {
         let mut at = 0;
         for (&choice, &size) in action.iter().zip(&self.sizes) {
