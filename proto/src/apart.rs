@@ -7,10 +7,10 @@ use tokio::runtime::{Handle, RuntimeFlavor};
 /// Longest message, bytes, that is read between two others. A part of a trajectory or of weights is shorter.
 const SHORT: usize = 2 << 20;
 
-/// One at a time: they would only take memory bandwidth from each other, and a processor from everybody else.
+/// One at a time: they would only take memory bandwidth from each other, and a processor from all other calls.
 static ONE: Mutex<()> = Mutex::new(());
 
-/// Runs work on a message of so many bytes. While a long one is read, other tasks of this thread run on another.
+/// Runs work on a message of this length in bytes. While a long one is read, other tasks of this thread run on another.
 pub fn apart<T>(bytes: usize, work: impl FnOnce() -> T) -> T {
     let elsewhere = || Handle::try_current().is_ok_and(|own| own.runtime_flavor() == RuntimeFlavor::MultiThread);
     if bytes <= SHORT || !elsewhere() {

@@ -1,5 +1,5 @@
 //! The wire stays readable: nothing of the contract of an earlier commit (`wire/3cfb71e.txt`) is removed, renumbered, retyped or
-//! renamed, unless `wire/allowed.txt` gives a reason. What is added is free. A field that goes leaves its number to nobody.
+//! renamed, unless `wire/allowed.txt` gives a reason. What is added is free. The number of a field that goes is not used again.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 

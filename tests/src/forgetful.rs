@@ -330,13 +330,15 @@ impl Style {
             Self::Ordered => since[draw(since.len())].clone(),
             Self::Any => {
                 let (old, new) = (durable, &since[draw(since.len())]);
+                // What is the same in both is not written again.
+                let same = old.iter().zip(new).take_while(|(a, b)| a == b).count();
                 match draw(3) {
                     // Half a write.
-                    0 => new[..draw(new.len() + 1)].to_vec(),
+                    0 => new[..same + draw(new.len() - same + 1)].to_vec(),
                     // The length is there, the rest of the data is not.
                     1 => {
                         let mut bytes = new.clone();
-                        let from = draw(new.len() + 1);
+                        let from = same + draw(new.len() - same + 1);
                         bytes[from..].fill(0);
                         bytes
                     }

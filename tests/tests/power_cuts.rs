@@ -62,7 +62,7 @@ impl Known {
     }
 }
 
-/// Iterations whose checkpoints were complete after so many steps.
+/// Numbers of steps after which the checkpoint of an iteration was complete.
 type Complete = Arc<Mutex<Vec<(usize, u32)>>>;
 
 #[derive(Debug)]
@@ -104,8 +104,17 @@ impl Trace {
         Self { before, steps: recorder.steps(), complete }
     }
 
-    /// Cuts the power after each step, `times` with different losses. Returns the number of cuts.
-    fn cut_everywhere(&self, known: &Known, seed: u64, times: u32) -> u32 {
+    /// The same run on a program that does not sync some things.
+    fn without(&self, unsynced: impl Fn(&Path) -> bool) -> Self {
+        let kept = |step: &Step| !matches!(step, Step::Sync(path) if unsynced(path));
+        let mut complete = self.complete.clone();
+        complete.iter_mut().for_each(|(at, _)| *at = self.steps[..*at].iter().filter(|step| kept(step)).count());
+        let steps = self.steps.iter().filter(|step| kept(step)).cloned().collect();
+        Self { before: self.before.clone(), steps, complete }
+    }
+
+    /// Cuts the power after each step, `times` with different losses. Returns the number of cuts, or what is wrong after one.
+    fn cut_everywhere(&self, known: &Known, seed: u64, times: u32) -> Result<u32, String> {
         let (mut model, mut cuts) = (self.before.clone(), 0);
         for done in 0..=self.steps.len() {
             if done > 0 {
@@ -117,12 +126,12 @@ impl Trace {
                 let place = tempfile::tempdir().unwrap();
                 model.after_power_cut(&mut stream, place.path());
                 let last = done.checked_sub(1).map(|last| &self.steps[last]);
-                let what = format!("seed {seed}, cut {done}.{time}, after {}", told(last));
-                check(known, &place.path().join("run"), promised, &what, stream.below(40) == 0);
+                check(known, &place.path().join("run"), promised, stream.below(40) == 0)
+                    .map_err(|wrong| format!("seed {seed}, cut {done}.{time}, after {}: {wrong}", told(last)))?;
                 cuts += 1;
             }
         }
-        cuts
+        Ok(cuts)
     }
 }
 
@@ -133,40 +142,46 @@ fn told(step: Option<&Step>) -> String {
 }
 
 /// The oracle: the run goes on with what was promised, or begins again if nothing was.
-fn check(known: &Known, run: &Path, promised: Option<u32>, what: &str, to_the_end: bool) {
+fn check(known: &Known, run: &Path, promised: Option<u32>, to_the_end: bool) -> Result<(), String> {
+    let holds = |what: &str, right: bool| if right { Ok(()) } else { Err(what.to_owned()) };
     let trainer = match RunFolderState::of(run) {
         RunFolderState::Empty | RunFolderState::Begun => {
-            assert_eq!(promised, None, "{what}: nothing is left of the run");
-            Claim::begin(run, &known.toml, "test", true).unwrap_or_else(|error| panic!("{what}: {error}"));
-            Trainer::create(&known.config, RunId("r".into()), run, 1).unwrap()
+            holds("nothing is left of the run", promised.is_none())?;
+            Claim::begin(run, &known.toml, "test", true).map_err(|error| error.to_string())?;
+            Trainer::create(&known.config, RunId("r".into()), run, 1).map_err(|error| error.to_string())?
         }
         RunFolderState::Run => {
-            assert_eq!(fs::read_to_string(run.join(CONFIG_FILE)).unwrap(), known.toml, "{what}");
+            holds(
+                "another config.toml",
+                fs::read_to_string(run.join(CONFIG_FILE)).is_ok_and(|text| text == known.toml),
+            )?;
             let complete = run.join("summary.json").exists();
-            let resumed = Trainer::resume(&known.config, run, 1);
-            let (trainer, skipped) = resumed.unwrap_or_else(|error| panic!("{what}: {error}"));
-            assert!(skipped.is_empty(), "{what}: {skipped:?}");
-            let iteration = checkpoint::read_latest(run, &known.states[0]).unwrap().0.iteration;
-            assert!(Some(iteration) >= promised, "{what}: iteration {iteration}, promised {promised:?}");
-            assert!(*trainer.learned() == known.states[iteration as usize], "{what}: other numbers");
-            assert!(trainer.missing_lines().is_empty(), "{what}: {:?}", trainer.missing_lines());
+            let (trainer, skipped) = Trainer::resume(&known.config, run, 1).map_err(|error| error.to_string())?;
+            holds(&format!("{skipped:?}"), skipped.is_empty())?;
+            let iteration =
+                checkpoint::read_latest(run, &known.states[0]).map_err(|error| error.to_string())?.0.iteration;
+            holds(&format!("iteration {iteration}, promised {promised:?}"), Some(iteration) >= promised)?;
+            holds("other numbers", *trainer.learned() == known.states[iteration as usize])?;
+            holds(&format!("missing lines: {:?}", trainer.missing_lines()), trainer.missing_lines().is_empty())?;
             let last = if complete { iteration + 1 } else { iteration };
-            assert_eq!(lines(run), (0..last).collect::<Vec<_>>(), "{what}");
+            holds("not the lines of its iterations", lines(run) == (0..last).collect::<Vec<_>>())?;
             trainer
         }
-        RunFolderState::Other => panic!("{what}: the folder is taken for something else"),
+        RunFolderState::Other => return Err("the folder is taken for something else".to_owned()),
     };
     if to_the_end {
         let ran = drive(trainer, &known.config, 1, &Arc::new(AtomicBool::new(false)));
-        assert_eq!(ran.sha256, known.sha256, "{what}");
-        assert_eq!(lines(run), (0..=ITERATIONS).collect::<Vec<_>>(), "{what}");
+        holds("other weights at the end", ran.sha256 == known.sha256)?;
+        holds("not all lines at the end", lines(run) == (0..=ITERATIONS).collect::<Vec<_>>())?;
     }
+    Ok(())
 }
 
 fn lines(run: &Path) -> Vec<u32> {
-    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap();
-    let number = |line: &str| serde_json::from_str::<serde_json::Value>(line).unwrap()["iteration"].as_u64().unwrap();
-    text.lines().map(|line| number(line) as u32).collect()
+    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+    let number = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["iteration"].as_u64();
+    // A line that is none is no iteration's.
+    text.lines().map(|line| number(line).map_or(u32::MAX, |number| number as u32)).collect()
 }
 
 /// Power cuts in whole runs, and in runs that continue after one.
@@ -176,7 +191,7 @@ fn cut(times: u32) -> u32 {
         let known = Known::of(config);
         let root = tempfile::tempdir().unwrap();
         let whole = Trace::record(&known, root.path());
-        cuts += whole.cut_everywhere(&known, number as u64, times);
+        cuts += whole.cut_everywhere(&known, number as u64, times).unwrap();
         for again in 0..2 {
             let mut model = whole.before.clone();
             whole.steps[..whole.steps.len() * (1 + again) / 3].iter().for_each(|step| model.step(step));
@@ -184,7 +199,7 @@ fn cut(times: u32) -> u32 {
             let mut stream = Key::new(9, Purpose::Spawn, &[again as u32]).stream();
             model.after_power_cut(&mut stream, root.path());
             let continued = Trace::record(&known, root.path());
-            cuts += continued.cut_everywhere(&known, 10 + number as u64, times);
+            cuts += continued.cut_everywhere(&known, 10 + number as u64, times).unwrap();
         }
     }
     cuts
@@ -194,6 +209,31 @@ fn cut(times: u32) -> u32 {
 fn a_power_cut_after_any_step_of_a_run_loses_nothing_that_was_complete() {
     let cuts = cut(1);
     assert!(cuts > 300, "{cuts} cuts");
+}
+
+/// Every sync is needed: without any one of them a power cut loses something.
+#[test]
+fn without_one_of_its_syncs_a_run_would_lose_something() {
+    let known = Known::of(mappo());
+    let root = tempfile::tempdir().unwrap();
+    let whole = Trace::record(&known, root.path());
+    let below = |path: &Path, folder: &str| path.parent() == Some(Path::new(folder));
+    let unfinished = |path: &Path| path.extension().is_some_and(|end| end == "tmp");
+    let cases: [(&str, &dyn Fn(&Path) -> bool); 7] = [
+        ("the folder that the run is in", &|path| path == Path::new("")),
+        ("the run folder", &|path| path == Path::new("run")),
+        ("config.toml", &|path| path == Path::new("run/.config.toml.tmp")),
+        ("metrics.jsonl", &|path| path == Path::new("run/metrics.jsonl")),
+        ("the folder of the checkpoints", &|path| path == Path::new("run/checkpoints")),
+        ("the folder of a checkpoint", &|path| below(path, "run/checkpoints") && unfinished(path)),
+        ("the files of a checkpoint", &|path| path.parent().is_some_and(|above| below(above, "run/checkpoints"))),
+    ];
+    for (what, unsynced) in cases {
+        let without = whole.without(unsynced);
+        assert!(without.steps.len() < whole.steps.len(), "{what} is not synced");
+        let lost = (0..20).find_map(|seed| without.cut_everywhere(&known, seed, 1).err());
+        assert!(lost.is_some(), "{what} is synced, and nothing is lost without it");
+    }
 }
 
 #[test]

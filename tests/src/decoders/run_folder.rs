@@ -37,7 +37,7 @@ pub struct RunFolder {
 pub enum Verdict {
     /// It was not used, for this reason.
     Refused(String),
-    /// The run goes on from this iteration; so many of its lines are missing, and named.
+    /// The run goes on from this iteration; the number of its lines that are missing, and named.
     Resumed(u32, usize),
     /// Nothing is left of what was trained: the run begins again.
     Anew,

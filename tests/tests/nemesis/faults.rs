@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 
 /// A fault; it is over when it returns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fault {
+pub(crate) enum Fault {
     KillActor,
     KillLearner,
     KillCommander,
@@ -39,7 +39,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    pub const ALL: [Self; 18] = [
+    pub(crate) const ALL: [Self; 18] = [
         Self::KillActor,
         Self::KillLearner,
         Self::KillCommander,
@@ -60,7 +60,7 @@ impl Fault {
         Self::LargeMessages,
     ];
 
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::KillActor => "an actor killed",
             Self::KillLearner => "the learner killed",
@@ -84,7 +84,7 @@ impl Fault {
     }
 
     /// Whether a service of the training ends by it.
-    pub fn kills(self) -> bool {
+    pub(crate) fn kills(self) -> bool {
         use Fault::{KillActor, KillAll, KillCommander, KillLearner, ReadOnlyDisk};
         [KillActor, KillLearner, KillCommander, KillAll, ReadOnlyDisk].contains(&self)
     }
@@ -104,8 +104,8 @@ const FREEZE: &str = "import ctypes, sys, time; c = ctypes.CDLL(None); t = int(s
     c.ptrace(0x4206, t, 0, 0); c.ptrace(0x4207, t, 0, 0); time.sleep(float(sys.argv[2]))";
 
 /// A training with three actors, a commander with missions, and what watches them.
-pub struct Target {
-    pub cluster: Cluster,
+pub(crate) struct Target {
+    pub(crate) cluster: Cluster,
     wall: Wall,
     place: tempfile::TempDir,
     /// Disks of the run and of the missions, where they can be mounted.
@@ -118,7 +118,7 @@ pub struct Target {
 }
 
 impl Target {
-    pub fn start(config: &RunConfig) -> Self {
+    pub(crate) fn start(config: &RunConfig) -> Self {
         let (wall, place) = (Wall::new(), tempfile::tempdir().unwrap());
         wall.set(0);
         let disks = SmallDisk::mount("24m").and_then(|run| Some([run, SmallDisk::mount("24m")?]));
@@ -142,7 +142,7 @@ impl Target {
     }
 
     /// Whether a fault is possible on this machine.
-    pub fn can(&self, fault: &Fault) -> bool {
+    pub(crate) fn can(&self, fault: &Fault) -> bool {
         match fault {
             Fault::FullDisk | Fault::ReadOnlyDisk => self.disks.is_some(),
             Fault::FreezeThread => self.python,
@@ -151,12 +151,12 @@ impl Target {
     }
 
     /// The folder of the training that a supervisor runs.
-    pub fn supervised(&self) -> PathBuf {
+    pub(crate) fn supervised(&self) -> PathBuf {
         self.place.path().join("supervised")
     }
 
     /// Lets it go on for a while, and looks.
-    pub fn live(&mut self, time: Duration) {
+    pub(crate) fn live(&mut self, time: Duration) {
         let until = Instant::now() + time;
         loop {
             self.logs.look(&self.cluster.logs());
@@ -170,7 +170,7 @@ impl Target {
         }
     }
 
-    pub fn watch_memory(&mut self) {
+    pub(crate) fn watch_memory(&mut self) {
         let commander = self.cluster.commander.as_ref().unwrap().id();
         for (name, pid) in
             [("learner", self.cluster.learner.id()), ("commander", commander), ("actor", self.cluster.actors[0].id())]
@@ -179,14 +179,14 @@ impl Target {
         }
     }
 
-    pub fn check_memory(&self, most: f64) {
+    pub(crate) fn check_memory(&self, most: f64) {
         for (name, memory) in &self.memory {
             assert!(memory.slope().0 <= most, "{name} grows by {:.2} MiB/h", memory.slope().0);
         }
     }
 
     /// Ends the training with a checkpoint of its last iteration.
-    pub fn finish(&mut self) -> String {
+    pub(crate) fn finish(&mut self) -> String {
         self.cluster.learner.signal("TERM");
         assert_eq!(self.cluster.learner.wait().code(), Some(75), "{}", self.cluster.learner.log());
         let log = self.cluster.learner.log();
@@ -212,7 +212,7 @@ impl Target {
     }
 
     /// Lets a fault happen, for a while if it is one that lasts.
-    pub fn afflict(&mut self, fault: &Fault, stream: &mut Stream, runtime: &tokio::runtime::Runtime) {
+    pub(crate) fn afflict(&mut self, fault: &Fault, stream: &mut Stream, runtime: &tokio::runtime::Runtime) {
         let time = Duration::from_millis(500 + u64::from(stream.below(4500)));
         let which = stream.below(3) as usize;
         match fault {

@@ -21,10 +21,10 @@ const LIVE: usize = 6;
 
 /// What a client saw.
 #[derive(Debug, Default)]
-pub struct History {
+pub(crate) struct History {
     /// Calls that were acknowledged, and that had no answer.
-    pub acknowledged: u64,
-    pub unanswered: u64,
+    pub(crate) acknowledged: u64,
+    pub(crate) unanswered: u64,
     /// Revisions of the shared mission that were acknowledged to this client, in order.
     shared: Vec<u64>,
     shared_unanswered: u64,
@@ -39,7 +39,7 @@ pub struct History {
 }
 
 #[derive(Debug)]
-pub struct Client {
+pub(crate) struct Client {
     number: u32,
     client: CommanderServiceClient<Channel>,
     stream: Stream,
@@ -75,7 +75,7 @@ fn content(assignment: &v1::Assignment) -> u32 {
 
 impl Client {
     /// Its own mission, and the shared one, must be there before anything goes wrong.
-    pub async fn start(url: &str, seed: u64, number: u32) -> Self {
+    pub(crate) async fn start(url: &str, seed: u64, number: u32) -> Self {
         let channel = client::endpoint(url).unwrap().connect().await.unwrap();
         let stream = Key::new(seed, Purpose::Request, &[number]).stream();
         let client = CommanderServiceClient::new(channel);
@@ -103,7 +103,7 @@ impl Client {
     }
 
     /// Calls until the token is cancelled.
-    pub async fn run(mut self, stop: CancellationToken) -> Self {
+    pub(crate) async fn run(mut self, stop: CancellationToken) -> Self {
         while !stop.is_cancelled() {
             match self.stream.below(10) {
                 0..=3 => self.update_own().await,
@@ -246,7 +246,7 @@ impl Client {
 }
 
 /// At the end, in peace: all that was acknowledged is there, and nothing else. Returns acknowledged and unanswered calls.
-pub async fn check(clients: Vec<Client>, url: &str) -> (u64, u64) {
+pub(crate) async fn check(clients: Vec<Client>, url: &str) -> (u64, u64) {
     let mut client = CommanderServiceClient::new(client::endpoint(url).unwrap().connect().await.unwrap());
     let request =
         v1::ListAssignmentsRequest { page_size: 500, source: v1::MissionSource::Client.into(), ..Default::default() };
@@ -275,6 +275,6 @@ pub async fn check(clients: Vec<Client>, url: &str) -> (u64, u64) {
     assert!(revisions.last().is_none_or(|last| *last <= shared.revision));
     // A creation whose deletion was answered first may have come through later.
     let strangers: Vec<&String> = found.keys().filter(|name| !name.starts_with("m-")).collect();
-    assert!(strangers.is_empty(), "nobody made {strangers:?}");
+    assert!(strangers.is_empty(), "no client made {strangers:?}");
     (acknowledged, unanswered)
 }

@@ -7,17 +7,17 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// A run that stands still for longer must have said why.
-pub const GAP: Duration = Duration::from_secs(10);
+pub(crate) const GAP: Duration = Duration::from_secs(10);
 
 /// Counts warnings and errors in logs that grow.
 #[derive(Debug, Default)]
-pub struct Logs {
+pub(crate) struct Logs {
     read: BTreeMap<PathBuf, u64>,
-    pub warnings: u64,
+    pub(crate) warnings: u64,
 }
 
 impl Logs {
-    pub fn look(&mut self, logs: &[PathBuf]) {
+    pub(crate) fn look(&mut self, logs: &[PathBuf]) {
         for path in logs {
             let from = self.read.entry(path.clone()).or_default();
             let Ok(mut file) = File::open(path) else { continue };
@@ -38,12 +38,12 @@ impl Logs {
 
 /// The longest time without an iteration.
 #[derive(Debug)]
-pub struct Gaps {
+pub(crate) struct Gaps {
     iteration: u32,
     since: Instant,
     warnings: u64,
-    pub longest: Duration,
-    pub explained: u32,
+    pub(crate) longest: Duration,
+    pub(crate) explained: u32,
 }
 
 impl Default for Gaps {
@@ -54,7 +54,7 @@ impl Default for Gaps {
 
 impl Gaps {
     /// The learner's answer at this moment, if it answers.
-    pub fn look(&mut self, iteration: Option<u32>, warnings: u64) {
+    pub(crate) fn look(&mut self, iteration: Option<u32>, warnings: u64) {
         let Some(iteration) = iteration.filter(|now| *now != self.iteration) else { return };
         let gap = self.since.elapsed();
         self.longest = self.longest.max(gap);
@@ -68,10 +68,10 @@ impl Gaps {
 
 /// Resident memory of a process over time.
 #[derive(Debug, Default)]
-pub struct Memory(Vec<(f64, f64)>);
+pub(crate) struct Memory(Vec<(f64, f64)>);
 
 impl Memory {
-    pub fn look(&mut self, pid: u32, since: Instant) {
+    pub(crate) fn look(&mut self, pid: u32, since: Instant) {
         let text = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("status")).unwrap_or_default();
         let kib =
             text.lines().find_map(|line| line.strip_prefix("VmRSS:")?.split_whitespace().next()?.parse::<f64>().ok());
@@ -81,7 +81,7 @@ impl Memory {
     }
 
     /// Slope of the least squares in MiB per hour, without the first third: caches fill. And the last value.
-    pub fn slope(&self) -> (f64, f64) {
+    pub(crate) fn slope(&self) -> (f64, f64) {
         let late = &self.0[self.0.len() / 3..];
         let count = late.len().max(1) as f64;
         let mean = |of: fn(&(f64, f64)) -> f64| late.iter().map(of).sum::<f64>() / count;
