@@ -147,12 +147,12 @@ const FILES: [&str; 3] = ["weights.safetensors", "optimiser.safetensors", "state
 
 /// Writes a checkpoint below `run/checkpoints` and removes the oldest beyond `keep`. Returns its folder.
 pub fn write(run: &Path, progress: &Progress, learned: &Learned, keep: u32) -> Result<PathBuf, CheckpointError> {
-    write_on(&mut FileSystem, run, progress, learned, keep)
+    write_on(&FileSystem, run, progress, learned, keep)
 }
 
 /// [`write()`] on a disk of the caller's.
 pub fn write_on(
-    disk: &mut dyn Disk,
+    disk: &dyn Disk,
     run: &Path,
     progress: &Progress,
     learned: &Learned,
@@ -164,6 +164,7 @@ pub fn write_on(
     if let Some(replay) = &learned.replay {
         replay::write(disk, run, replay)?;
     }
+    disk.create_dir(&parent).map_err(in_file(&parent))?;
     if let Err(error) = fill(disk, &temporary, progress, learned) {
         // Half a checkpoint is of no use and takes room, which may be what is missing.
         let _ = disk.remove_dir(&temporary);
@@ -179,8 +180,9 @@ pub fn write_on(
         disk.rename(&folder, &replaced).map_err(in_file(&folder))?;
     }
     disk.rename(&temporary, &folder).map_err(in_file(&folder))?;
-    // The renames must survive a power cut before anything older goes.
+    // The renames must survive a power cut before anything older goes, and with the first one the folder that they are in.
     disk.sync(&parent).map_err(in_file(&parent))?;
+    disk.sync(run).map_err(in_file(run))?;
     let newest_first = list(run).into_iter().rev();
     let surplus = std::iter::once(replaced).filter(|old| old.exists()).chain(newest_first.skip(keep.max(1) as usize));
     for old in surplus {
@@ -191,13 +193,13 @@ pub fn write_on(
     }
     if let Some(replay) = &learned.replay {
         let oldest = list(run).first().and_then(|folder| numbered(folder.clone())).map_or(0, |(number, ..)| number);
-        replay::remove(run, |iteration| u64::from(iteration) + (replay.block_count() as u64) < oldest);
+        replay::remove(disk, run, |iteration| u64::from(iteration) + (replay.block_count() as u64) < oldest);
     }
     Ok(folder)
 }
 
 /// Everything that a checkpoint consists of, under its temporary name, safe from a power cut.
-fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
+fn fill(disk: &dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
     if folder.exists() {
         disk.remove_dir(folder).map_err(in_file(folder))?;
     }
@@ -225,11 +227,11 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
 
 /// Removes what a kill left of checkpoints that were being written, and the episodes of iterations from `iteration` on, which will
 /// be collected again. No other process may be writing.
-pub fn clean(run: &Path, iteration: u32) {
-    replay::remove(run, |other| other >= iteration);
+pub fn clean(disk: &dyn Disk, run: &Path, iteration: u32) {
+    replay::remove(disk, run, |other| other >= iteration);
     let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
     for path in entries.map(|entry| entry.path()).filter(|path| hidden(path, ".tmp").is_some()) {
-        if let Err(error) = fs::remove_dir_all(&path) {
+        if let Err(error) = disk.remove_dir(&path) {
             // It only takes room.
             tracing::warn!(%error, path = %path.display(), "an unfinished checkpoint cannot be removed");
         }

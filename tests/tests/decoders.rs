@@ -15,6 +15,7 @@ use magex_runtime::{client, server};
 use magex_tests::decoders::files::Run;
 use magex_tests::decoders::mutate::Mutations;
 use magex_tests::decoders::{dispatch, wire};
+use magex_tests::raw::Raw;
 use prost::Message as _;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
@@ -177,46 +178,6 @@ fn weights_files_and_checkpoints() {
     run("checkpoint", damaged.good_files(), 6_000, |bytes| damaged.checkpoint(bytes));
 }
 
-/// Sends bytes as they are.
-#[derive(Debug, Clone, Copy, Default)]
-struct Raw;
-
-impl tonic::codec::Codec for Raw {
-    type Encode = Vec<u8>;
-    type Decode = Vec<u8>;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        *self
-    }
-
-    fn decoder(&mut self) -> Self {
-        *self
-    }
-}
-
-impl tonic::codec::Encoder for Raw {
-    type Item = Vec<u8>;
-    type Error = tonic::Status;
-
-    fn encode(&mut self, item: Vec<u8>, buffer: &mut tonic::codec::EncodeBuf<'_>) -> Result<(), tonic::Status> {
-        bytes::BufMut::put_slice(buffer, &item);
-        Ok(())
-    }
-}
-
-impl tonic::codec::Decoder for Raw {
-    type Item = Vec<u8>;
-    type Error = tonic::Status;
-
-    fn decode(&mut self, buffer: &mut tonic::codec::DecodeBuf<'_>) -> Result<Option<Vec<u8>>, tonic::Status> {
-        let mut bytes = vec![0; bytes::Buf::remaining(buffer)];
-        bytes::Buf::copy_to_slice(buffer, &mut bytes);
-        Ok(Some(bytes))
-    }
-}
-
 /// Whatever comes in over the wire, the service answers with sense, in time, and goes on.
 #[tokio::test(flavor = "multi_thread")]
 async fn the_whole_commander() {
@@ -252,7 +213,7 @@ async fn the_whole_commander() {
             let bytes = mutations.draw();
             raw.ready().await.unwrap();
             let path = PathAndQuery::try_from(format!("/magex.v1.CommanderService/{method}")).unwrap();
-            let call = raw.unary(Request::new(bytes.clone()), path, Raw);
+            let call = raw.unary(Request::new(bytes.clone().into()), path, Raw);
             match tokio::time::timeout(Duration::from_secs(60), call).await.unwrap() {
                 Ok(answer) => {
                     answered += 1;

@@ -1,7 +1,7 @@
 //! The command line: the tables of docs/results.md, measured on this machine.
 
 use crate::report::Report;
-use crate::{assign, cluster, env, goals, runs, soak, tasks, training, update};
+use crate::{assign, cluster, env, goals, messages, runs, soak, tasks, training, update};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use magex::failure;
 use magex::options::CommonOptions;
@@ -62,6 +62,8 @@ enum What {
     Generalisation(runs::GeneralisationArgs),
     /// The learner's wire: throughput, many actors, weights to many subscribers, restart after a kill.
     Cluster(cluster::ClusterArgs),
+    /// Health checks of a commander beside messages of 31 MiB.
+    Messages(messages::MessagesArgs),
     /// Memory and open files of a training cluster over an hour.
     Soak(soak::SoakArgs),
     /// The learner process of `cluster`: only ingests.
@@ -74,7 +76,7 @@ enum What {
 /// The command lines that run without a subcommand.
 const QUICK: [&[&str]; 4] = [&["env"], &["update"], &["assign", "--solver"], &["commander"]];
 /// The command lines of `all`.
-const ALL: [&[&str]; 9] = [
+const ALL: [&[&str]; 10] = [
     &["env"],
     &["update"],
     &["assign"],
@@ -82,6 +84,7 @@ const ALL: [&[&str]; 9] = [
     &["ranking"],
     &["distributed"],
     &["cluster"],
+    &["messages"],
     &["train"],
     &["tasks"],
 ];
@@ -135,6 +138,7 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Tasks(args) => tasks::tasks(args),
         What::Generalisation(args) => runs::generalisation(args),
         What::Cluster(args) => cluster::cluster(args),
+        What::Messages(args) => messages::messages(args),
         What::Soak(args) => soak::soak(args),
         What::Ingest(_) | What::All => Err(anyhow::anyhow!("this is not a table")),
     }

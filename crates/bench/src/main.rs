@@ -9,6 +9,7 @@ mod cluster;
 mod env;
 mod fleet;
 mod goals;
+mod messages;
 mod report;
 mod runs;
 mod soak;
