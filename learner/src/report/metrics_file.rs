@@ -104,6 +104,11 @@ impl RunObserver for MetricsFile {
         }
     }
 
+    fn went_back(&mut self, folder: &Path, iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
+        *self = Self::reopen(folder, iteration)?;
+        Ok(())
+    }
+
     fn sync(&mut self) {
         if let Err(error) = self.file.sync_data() {
             tracing::debug!(%error, "metrics.jsonl cannot be made durable");

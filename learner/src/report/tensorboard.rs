@@ -6,7 +6,7 @@
 //!
 //! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
 
-use crate::report::observer::RunObserver;
+use crate::report::observer::{FileError, RunObserver};
 use crate::report::records::IterationMetrics;
 use magex_proto::v1::IterationEvent;
 use prost::Message;
@@ -101,6 +101,12 @@ impl EventFile {
 impl RunObserver for EventFile {
     fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         self.append(&report.metrics_json, report.joint_env_steps);
+    }
+
+    /// Another file, as after a resume.
+    fn went_back(&mut self, folder: &Path, _iteration: u32, joint_env_steps: u64) -> Result<(), FileError> {
+        *self = Self::new(folder, Some(joint_env_steps));
+        Ok(())
     }
 }
 

@@ -90,6 +90,7 @@ impl Trainer {
         self.observers.iter_mut().try_for_each(|observer| observer.flush())?;
         self.notify(|observer| observer.sync());
         let progress = Progress { wall_s: self.wall_s(), ..self.progress.clone() };
-        Ok(checkpoint::write(&self.folder, &progress, &self.learned, self.config.run.keep_checkpoints)?)
+        let keep = (self.config.run.keep_checkpoints, self.unconfirmed_since);
+        Ok(checkpoint::write_keeping(&mut FileSystem, &self.folder, &progress, &self.learned, keep)?)
     }
 }
