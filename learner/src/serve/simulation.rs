@@ -35,7 +35,7 @@ use tokio_util::sync::CancellationToken;
 /// The default time of a lease.
 const LEASE: Duration = Duration::from_secs(15);
 const ACTORS: usize = 4;
-const ITERATIONS: u32 = 6;
+const ITERATIONS: u32 = 8;
 const EVALUATIONS: u32 = 1;
 const TRAININGS: u32 = 5;
 
@@ -365,19 +365,19 @@ fn the_same_seed_gives_the_same_schedule() {
     }
 }
 
-/// Whether the simulation finds that something is missing.
-fn found(product: Product, troubles: Troubles) -> bool {
-    std::panic::catch_unwind(|| play(1, product, troubles)).is_err()
+/// How many of ten schedules show that something is missing.
+fn found(product: Product, troubles: Troubles) -> usize {
+    (1..=10).filter(|&seed| std::panic::catch_unwind(|| play(seed, product, troubles)).is_err()).count()
 }
 
 #[test]
 fn an_actor_that_hangs_is_found_without_hedges_and_costs_nothing_with_them() {
-    assert!(found(Product::WithoutHedges, Troubles::Hang));
-    assert!(!found(Product::Whole, Troubles::Hang));
+    assert_eq!(found(Product::Whole, Troubles::Hang), 0);
+    assert!(found(Product::WithoutHedges, Troubles::Hang) > 0);
 }
 
 #[test]
 fn an_actor_without_a_commander_is_found_without_hedges_and_costs_nothing_with_them() {
-    assert!(found(Product::WithoutHedges, Troubles::NoCommander));
-    assert!(!found(Product::Whole, Troubles::NoCommander));
+    assert_eq!(found(Product::Whole, Troubles::NoCommander), 0);
+    assert!(found(Product::WithoutHedges, Troubles::NoCommander) > 0);
 }

@@ -40,6 +40,12 @@ pub enum UpdateError {
     Commander(#[from] CommanderError),
 }
 
+impl From<candle_core::Error> for UpdateError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Weights(error.into())
+    }
+}
+
 /// Largest difference between the log-probabilities of an actor or commander and those that the learner recomputes. They have the
 /// same bits where both run the same operations; across batch shapes and processors single precision leaves less than this.
 pub const LOG_PROB_TOLERANCE: f64 = 1e-4;

@@ -84,7 +84,7 @@ pub(super) async fn run(world: Rc<World>, number: usize) {
         if evicted {
             own.lies.set(false);
         }
-        sleep(Duration::from_millis(100) + up_to(random, 900)).await;
+        sleep(Duration::from_millis(100) + up_to(&mut random, 900)).await;
     }
 }
 
@@ -246,7 +246,8 @@ async fn connect(world: &Rc<World>, number: usize, process: u64, random: &mut St
 }
 
 fn delay(random: &mut Stream) -> Duration {
-    up_to(random, if random.below(50) == 0 { 400 } else { 15 })
+    let most = if random.below(50) == 0 { 400 } else { 15 };
+    up_to(random, most)
 }
 
 /// Results may arrive twice, and after what was said later.
