@@ -166,7 +166,6 @@ impl World {
     fn check(&self) {
         let seed = self.seed;
         let Process { shared, .. } = self.learner();
-        let now = Instant::now();
         let sessions = shared.roster.sessions();
         shared.work.inspect(|ledger| {
             let (shards, episodes) = (ledger.counters(), ledger.episodes());
@@ -178,10 +177,10 @@ impl World {
                 self.trained_before.get() + done as u64,
                 "seed {seed}: a shard counts twice, or not at all"
             );
-            for (session, _) in &sessions {
+            for (session, entry) in &sessions {
+                // The session looks whenever it hears its actor; one that falls silent is in the log for that.
                 let stalled = |oldest: &super::ledger::OldestLease| {
-                    // The session looks with every heartbeat; wires delay those by less than a second.
-                    now - oldest.since > ledger.stalled(oldest.shard.kind) + LEASE / 4 + Duration::from_secs(1)
+                    entry.last_seen > oldest.since + ledger.stalled(oldest.shard.kind)
                 };
                 if ledger.oldest_of(*session).as_ref().is_some_and(stalled) {
                     self.stalls.set(self.stalls.get() + 1);
