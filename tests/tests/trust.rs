@@ -222,7 +222,7 @@ fn an_actor_that_hangs_stops_nothing_is_named_and_ends_itself() {
         }
     });
     let hung = Played::start(&cluster, cluster.commander_address(), "hung", Duration::ZERO, hang);
-    wait_until("the first results", || hung.made.load(Ordering::SeqCst) > 9 || cluster.iterations() > 2);
+    wait_until("the first results", || hung.made.load(Ordering::SeqCst) >= 9 || cluster.iterations() > 2);
     cluster.start_actor();
     cluster.start_actor();
     assert_eq!(cluster.finish(), undisturbed(&config));

@@ -251,15 +251,15 @@ impl Session {
     where
         S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
     {
-        // Subscribed before the first grant, so that shards queued after it wake this loop.
-        let mut wakeups = self.shared.work.lease_wakeups();
+        let wakeups = self.shared.work.lease_wakeups();
         let (closing, complete) = (self.shared.control.closing.clone(), self.shared.control.complete.clone());
         let (Signals { replaced, mut sent_away }, outbound) = (self.signals.clone(), self.outbound.clone());
         if let Err(end) = self.send(self.welcome()).await {
             return end;
         }
         loop {
-            wakeups.borrow_and_update();
+            // Made before the grant, so that shards queued after it wake this loop.
+            let offered = wakeups.notified();
             if let Err(end) = self.grant_leases().await {
                 return end;
             }
@@ -288,7 +288,7 @@ impl Session {
                     // The time spent on this message is not silence of the actor.
                     self.mark_seen();
                 }
-                changed = wakeups.changed(), if self.credit > 0 => if changed.is_err() { return SessionEnd::Closing },
+                () = offered, if self.credit > 0 => {}
                 () = outbound.closed() => return SessionEnd::Left,
                 () = until(next_grant) => {}
                 () = tokio::time::sleep_until(deadline) => return SessionEnd::Silent,

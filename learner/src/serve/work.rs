@@ -14,7 +14,7 @@ use magex_core::trajectory::ShardResult;
 use magex_runtime::trace;
 use std::sync::{Arc, Condvar};
 use std::time::{Duration, Instant};
-use tokio::sync::watch;
+use tokio::sync::Notify;
 use tracing::Span;
 
 #[derive(Debug)]
@@ -55,8 +55,8 @@ pub(crate) struct Work {
     open: OrderedMutex<OpenWork>,
     /// The training thread waits here for the end of the plan.
     settled: Condvar,
-    /// Changes when there are shards to lease.
-    lease_wakeups: watch::Sender<u64>,
+    /// Wakes sessions, in the order in which they began to wait, when there are shards to lease.
+    lease_wakeups: Arc<Notify>,
     metrics: Arc<LearnerMetrics>,
 }
 
@@ -67,7 +67,7 @@ impl Work {
         Self {
             open: OrderedMutex::new(Rank::Work, open),
             settled: Condvar::new(),
-            lease_wakeups: watch::Sender::new(0),
+            lease_wakeups: Arc::default(),
             metrics,
         }
     }
@@ -89,7 +89,7 @@ impl Work {
             self.settled.notify_all();
         }
         if offers > before {
-            self.lease_wakeups.send_modify(|generation| *generation = generation.wrapping_add(1));
+            self.lease_wakeups.notify_waiters();
         }
         value
     }
@@ -103,8 +103,8 @@ impl Work {
     }
 
     /// Notified after every change that offers something to lease.
-    pub(crate) fn lease_wakeups(&self) -> watch::Receiver<u64> {
-        self.lease_wakeups.subscribe()
+    pub(crate) fn lease_wakeups(&self) -> Arc<Notify> {
+        self.lease_wakeups.clone()
     }
 
     /// Opens a plan within the current span.
