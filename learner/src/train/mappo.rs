@@ -202,6 +202,27 @@ impl Mappo {
         Ok(total.stats(parts))
     }
 
+    /// The log-probabilities [E, T, N] of a batch's actions under these networks: what its actors should have sent.
+    pub fn log_probs(&self, learned: &Learned, batch: &Batch) -> Result<Vec<f32>> {
+        let (steps, n) = (batch.shape.steps, batch.shape.agents);
+        let networks = &learned.networks[..self.model.parts().len()];
+        let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
+        let policy = self.model.policy(&mut networks.iter().map(constant).collect::<Result<Vec<_>>>()?)?;
+        let mut out = Vec::with_capacity(batch.shape.episodes * steps * n);
+        for episode in 0..batch.shape.episodes {
+            let mut hidden = vec![0.0; n * self.model.memory()];
+            for start in (0..steps).step_by(self.chunk) {
+                let slice = Slice { batch, units: &[(episode, start)], chunk: self.chunk, samples: 0.0 };
+                let features = slice.features();
+                let input = slice.input(&features, hidden.clone(), slice.noise());
+                let now = policy.evaluate(&input, &slice.actions())?;
+                out.extend(now.log_probs.to_vec1::<f32>()?);
+                hidden = last_state(now.states.as_ref(), hidden)?;
+            }
+        }
+        Ok(out)
+    }
+
     /// Values of all T+1 states of one episode, and the memories entering each chunk, by running both networks through
     /// the episode a chunk at a time.
     fn evaluate(&self, networks: &[Network], batch: &Batch, episode: usize) -> Result<Evaluation> {
