@@ -70,7 +70,7 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
         run::run(config, PolicyWorker::maker(), metrics, stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
-            ActorError::Evicted(..) => Failure::new(exit::INTERNAL, &error),
+            ActorError::Evicted(..) | ActorError::Stuck { .. } => Failure::new(exit::INTERNAL, &error),
             ActorError::Refused(..) | ActorError::Unusable(_) | ActorError::Worker(..) => {
                 Failure::new(exit::UNAVAILABLE, &error)
             }

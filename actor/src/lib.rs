@@ -5,6 +5,7 @@
 //! | [`run`] | the actor's loop: connect, work, reconnect, until shutdown or the end of the run |
 //! | `session` | one connection to the learner: leases in, results out |
 //! | `rollout_pool` | the rollout threads of one run |
+//! | [`pulse`] | whether a rollout thread still moves |
 //! | [`worker`] | the seam between the pool and the rollout, and the worker of production |
 //! | [`rollout`] | the rollout of one shard: a pure function of shard, seed, task, weights and goals |
 //! | [`goal_client`] | the goals of a shard, from the commander service |
@@ -15,6 +16,7 @@
 pub mod cli;
 pub mod goal_client;
 mod metrics;
+pub mod pulse;
 pub mod rollout;
 mod rollout_pool;
 pub mod run;

@@ -5,6 +5,7 @@ mod buffers;
 mod policy;
 
 use self::policy::{Carried, KeyedChooser};
+use crate::pulse::Pulse;
 use buffers::{Buffers, chain};
 use magex_core::config::RunConfig;
 use magex_core::error::FieldError;
@@ -65,6 +66,8 @@ pub struct Roller {
     config: RunConfig,
     model: Model,
     source: Source,
+    /// Beats once per joint step.
+    pub pulse: Pulse,
 }
 
 impl std::fmt::Debug for Roller {
@@ -79,12 +82,13 @@ impl Roller {
     pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         let model = Model::new(config)?;
         let source = Source::Policy(model.load_policy(weights)?);
-        Ok(Self { config: config.clone(), model, source })
+        Ok(Self { config: config.clone(), model, source, pulse: Pulse::default() })
     }
 
     /// With a controller instead of a policy (evaluation only).
     pub fn with_controller(config: &RunConfig, make: MakeController) -> Result<Self, ParamError> {
-        Ok(Self { config: config.clone(), model: Model::new(config)?, source: Source::Controller(make) })
+        let source = Source::Controller(make);
+        Ok(Self { config: config.clone(), model: Model::new(config)?, source, pulse: Pulse::default() })
     }
 
     /// Share of random actions of action values; `None` for a policy, which is sampled. Evaluations know no iteration: they explore as
@@ -137,6 +141,7 @@ impl Roller {
         let mut chosen = KeyedChooser::new(self.model.heads(), n, shard.mode, keys.iter().map(|k| k.action));
         chosen.epsilon = self.epsilon(shard);
         for step in 0..=steps {
+            self.pulse.beat();
             state.read(&worlds)?;
             if keep {
                 out.positions.extend_from_slice(&state.positions);

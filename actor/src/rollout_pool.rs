@@ -2,6 +2,7 @@
 
 use crate::goal_client::{GoalError, GrpcGoals, WeightsKey};
 use crate::metrics::ActorMetrics;
+use crate::pulse::{Pulse, Watch};
 use crate::weights_cache::WeightsCache;
 use crate::worker::{MakeWorker, WorkError, Worker};
 use bytes::Bytes;
@@ -71,6 +72,7 @@ pub(crate) struct RolloutPool {
     cancelled: CancellationToken,
     metrics: Arc<ActorMetrics>,
     threads: Vec<JoinHandle<()>>,
+    watch: Watch,
     /// Shards submitted whose outcome has not been taken.
     busy: usize,
 }
@@ -90,10 +92,14 @@ impl RolloutPool {
         // Used to count steps only; the workers parse the configuration themselves and report its errors.
         let task = RunConfig::from_toml(&welcome.run_config_toml).ok().map(|config| config.task);
         metrics.threads.set(threads as f64);
-        let mut pool = Self { welcome, lease, shards, outcomes, cancelled, metrics, threads: Vec::new(), busy: 0 };
-        for number in 0..threads {
+        let pulses: Vec<Pulse> = (0..threads).map(|_| Pulse::default()).collect();
+        let watch = Watch::new(pulses.iter().cloned());
+        let mut pool =
+            Self { welcome, lease, shards, outcomes, cancelled, metrics, threads: Vec::new(), watch, busy: 0 };
+        for (number, pulse) in pulses.into_iter().enumerate() {
             let rollout = RolloutThread {
-                worker: (context.make_worker)(&pool.welcome)?,
+                worker: make_worker(&context, &pool.welcome, &pulse)?,
+                pulse,
                 welcome: pool.welcome.clone(),
                 lease,
                 context: context.clone(),
@@ -116,6 +122,11 @@ impl RolloutPool {
 
     pub(crate) fn idle(&self) -> usize {
         self.threads.len().saturating_sub(self.busy)
+    }
+
+    /// The number of a thread that has not moved for so many calls although it has a shard.
+    pub(crate) fn stuck(&mut self, calls: u32) -> Option<usize> {
+        self.watch.stuck(calls)
     }
 
     /// Queues a shard for the first idle thread; false if the queue is full.
@@ -159,8 +170,15 @@ impl Drop for RolloutPool {
     }
 }
 
+fn make_worker(context: &PoolContext, welcome: &Welcome, pulse: &Pulse) -> Result<Box<dyn Worker>, WorkError> {
+    let mut worker = (context.make_worker)(welcome)?;
+    worker.beat(pulse.clone());
+    Ok(worker)
+}
+
 struct RolloutThread {
     worker: Box<dyn Worker>,
+    pulse: Pulse,
     welcome: Welcome,
     lease: Duration,
     context: PoolContext,
@@ -177,7 +195,9 @@ impl RolloutThread {
             if self.cancelled.is_cancelled() {
                 return;
             }
+            self.pulse.set_busy(true);
             let result = self.roll_out(&leased);
+            self.pulse.set_busy(false);
             let outcome = ShardOutcome { lease_id: leased.lease_id, shard: leased.shard, result };
             if results.blocking_send(outcome).is_err() {
                 return;
@@ -199,6 +219,7 @@ impl RolloutThread {
         let cancelled = || WorkError::Retryable(GoalError::Cancelled.to_string());
         let weights = arrived.ok_or_else(cancelled)?.map_err(|late| WorkError::Retryable(late.to_string()))?;
         drop(span);
+        self.pulse.beat();
         let weights_wait_seconds = begun.elapsed().as_secs_f64();
         let (cancelled, span) = (self.cancelled.clone(), leased.span.clone());
         let mut goals = GrpcGoals::new(runtime, commander, key, self.lease, cancelled, span);
@@ -208,7 +229,7 @@ impl RolloutThread {
             Ok(result) => result?,
             Err(panic) => {
                 // The panic may have left the worker in an inconsistent state.
-                self.worker = (self.context.make_worker)(&self.welcome)?;
+                self.worker = make_worker(&self.context, &self.welcome, &self.pulse)?;
                 return Err(WorkError::fatal(format!("the worker panicked: {}", panic_text(panic.as_ref()))));
             }
         };

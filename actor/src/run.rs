@@ -66,6 +66,18 @@ pub enum ActorError {
     /// An error that every shard would meet.
     #[error("this actor cannot process any shard: {0}")]
     Unusable(WorkError),
+    /// A rollout thread hangs. Only a new process gets rid of it.
+    #[error(
+        "rollout thread {thread} has not moved for {} s although it has a shard: it hangs; this actor ends so that a new process \
+         takes its place (look at that machine: a debugger, memory that cannot be paged in, processor time that is used up)",
+        still.as_secs_f64()
+    )]
+    Stuck {
+        /// Which thread.
+        thread: usize,
+        /// How long it has been still.
+        still: Duration,
+    },
     /// This build cannot work on the run of this id.
     #[error("cannot work on run '{0}': {1}")]
     Worker(String, #[source] WorkError),
@@ -157,6 +169,7 @@ impl Actor {
                     return Err(ActorError::Evicted(self.config.learner_url.clone(), reason));
                 }
                 SessionEnd::Unusable(error) => return Err(ActorError::Unusable(error)),
+                SessionEnd::Stuck(thread, still) => return Err(ActorError::Stuck { thread, still }),
                 SessionEnd::Broken(reason) => self.complain(&Status::unavailable(reason), &mut complaints).await,
                 SessionEnd::Failed(status) => self.complain(&status, &mut complaints).await,
             }

@@ -17,6 +17,12 @@ use tonic::{Status, Streaming};
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 const LONGEST_LEASE: Duration = Duration::from_secs(3600);
 
+/// A rollout thread that has a shard and has not moved for so many leases hangs. Each of its waits (for weights, for goals) ends after
+/// one.
+const STUCK_LEASES: u32 = 8;
+/// Heartbeats per lease.
+const BEATS: u32 = 4;
+
 #[derive(Debug)]
 pub(crate) enum SessionEnd {
     /// The actor shuts down.
@@ -33,6 +39,8 @@ pub(crate) enum SessionEnd {
     Evicted(String),
     /// This process cannot process any shard.
     Unusable(WorkError),
+    /// This rollout thread has not moved for this time.
+    Stuck(usize, Duration),
 }
 
 impl From<Status> for SessionEnd {
@@ -131,7 +139,7 @@ impl<'a> Session<'a> {
     ) -> SessionEnd {
         let again = self.unacknowledged.iter().flat_map(|(&lease_id, result)| in_parts(lease_id, result));
         self.bulk.extend(again);
-        let mut heartbeat = tokio::time::interval(self.pool.lease / 4);
+        let mut heartbeat = tokio::time::interval(self.pool.lease / BEATS);
         heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let outbound = self.outbound.clone();
         loop {
@@ -173,9 +181,14 @@ impl<'a> Session<'a> {
                     Some(outcome) => self.on_outcome(outcome),
                     None => return SessionEnd::Refused("all rollout threads ended".to_owned()),
                 },
-                _ = heartbeat.tick() => if !has_messages {
-                    self.urgent.push_back(Request::Heartbeat(v1::Heartbeat {}));
-                },
+                _ = heartbeat.tick() => {
+                    if let Some(thread) = self.pool.stuck(STUCK_LEASES * BEATS) {
+                        return SessionEnd::Stuck(thread, STUCK_LEASES * self.pool.lease);
+                    }
+                    if !has_messages {
+                        self.urgent.push_back(Request::Heartbeat(v1::Heartbeat {}));
+                    }
+                }
                 () = shutdown.cancelled() => return SessionEnd::Shutdown,
             }
         }

@@ -1,6 +1,7 @@
 //! The seam between the rollout pool and the rollout, and the worker of production.
 
 use crate::goal_client::{GoalError, GrpcGoals};
+use crate::pulse::Pulse;
 use crate::rollout::{Roller, RolloutError};
 use magex_core::config::RunConfig;
 use magex_core::ids::Shard;
@@ -13,6 +14,10 @@ use std::sync::Arc;
 pub trait Worker: Send {
     /// Rolls out one shard with the weights that it names.
     fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError>;
+
+    /// Called once, before any work: the worker beats this pulse while it gets on. A worker that does not is taken for stuck when
+    /// a shard takes it eight times the time of a lease.
+    fn beat(&mut self, _pulse: Pulse) {}
 }
 
 /// Why a shard failed.
@@ -57,6 +62,7 @@ pub struct PolicyWorker {
     config: RunConfig,
     /// With the SHA-256 of its weights.
     roller: Option<(String, Roller)>,
+    pulse: Pulse,
 }
 
 impl PolicyWorker {
@@ -75,7 +81,7 @@ impl PolicyWorker {
                 welcome.task_fingerprint
             )));
         }
-        Ok(Self { config, roller: None })
+        Ok(Self { config, roller: None, pulse: Pulse::default() })
     }
 
     /// A factory of such workers.
@@ -86,14 +92,22 @@ impl PolicyWorker {
     fn roller(&mut self, weights: &Weights) -> Result<&Roller, WorkError> {
         let roller = match self.roller.take() {
             Some((sha256, roller)) if sha256 == weights.sha256 => roller,
-            _ => Roller::new(&self.config, &weights.bytes)
-                .map_err(|error| WorkError::fatal(format!("weights version {}: {error}", weights.version)))?,
+            _ => {
+                let mut roller = Roller::new(&self.config, &weights.bytes)
+                    .map_err(|error| WorkError::fatal(format!("weights version {}: {error}", weights.version)))?;
+                roller.pulse = self.pulse.clone();
+                roller
+            }
         };
         Ok(&self.roller.insert((weights.sha256.clone(), roller)).1)
     }
 }
 
 impl Worker for PolicyWorker {
+    fn beat(&mut self, pulse: Pulse) {
+        self.pulse = pulse;
+    }
+
     fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         self.roller(weights)?.rollout(shard, |request| goals.assign(request)).map_err(|error| match error {
             RolloutError::Goals(error) => WorkError::Goals(error),

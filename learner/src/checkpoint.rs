@@ -158,6 +158,17 @@ pub fn write_on(
     learned: &Learned,
     keep: u32,
 ) -> Result<PathBuf, CheckpointError> {
+    write_keeping(disk, run, progress, learned, (keep, None))
+}
+
+/// [`write_on`] that also keeps the newest checkpoint of an iteration up to `back_to`, which a return may need.
+pub(crate) fn write_keeping(
+    disk: &dyn Disk,
+    run: &Path,
+    progress: &Progress,
+    learned: &Learned,
+    (keep, back_to): (u32, Option<u32>),
+) -> Result<PathBuf, CheckpointError> {
     let parent = run.join("checkpoints");
     let name = format!("{:06}", progress.iteration);
     let (temporary, folder) = (parent.join(format!(".{name}.tmp")), parent.join(&name));
@@ -183,8 +194,10 @@ pub fn write_on(
     // The renames must survive a power cut before anything older goes, and with the first one the folder that they are in.
     disk.sync(&parent).map_err(in_file(&parent))?;
     disk.sync(run).map_err(in_file(run))?;
+    let needed = back_to.and_then(|iteration| up_to(run, iteration).pop());
     let newest_first = list(run).into_iter().rev();
-    let surplus = std::iter::once(replaced).filter(|old| old.exists()).chain(newest_first.skip(keep.max(1) as usize));
+    let old = newest_first.skip(keep.max(1) as usize).filter(|old| Some(old) != needed.as_ref());
+    let surplus = std::iter::once(replaced).filter(|old| old.exists()).chain(old);
     for old in surplus {
         if let Err(error) = disk.remove_dir(&old) {
             // The checkpoint itself is there.
@@ -247,6 +260,34 @@ pub fn list(run: &Path) -> Vec<PathBuf> {
     let names: Vec<u64> = folders.iter().filter(|(.., in_place, _)| *in_place).map(|(number, ..)| *number).collect();
     let counts = |(number, in_place, _): &(u64, bool, PathBuf)| *in_place || !names.contains(number);
     folders.into_iter().filter(counts).map(|(.., path)| path).collect()
+}
+
+/// Checkpoints of iterations up to this one, oldest first.
+fn up_to(run: &Path, iteration: u32) -> Vec<PathBuf> {
+    let older = |path: &PathBuf| numbered(path.clone()).is_some_and(|(number, ..)| number <= iteration.into());
+    list(run).into_iter().filter(older).collect()
+}
+
+/// Renames the checkpoints so that no resume continues from them.
+pub(crate) fn set_aside(run: &Path) {
+    if let Err(error) = fs::rename(run.join("checkpoints"), run.join("checkpoints.tainted")) {
+        tracing::error!(%error, path = %run.display(), "the checkpoints cannot be set aside; do not continue from them");
+    }
+}
+
+/// Goes back: the newest checkpoint of an iteration up to this one that can be read. All newer ones are removed.
+pub(crate) fn go_back(run: &Path, iteration: u32, template: &Learned) -> Option<(Progress, Learned)> {
+    let (folder, found) = up_to(run, iteration).into_iter().rev().find_map(|folder| {
+        let found = read(&folder, template).inspect_err(|error| tracing::warn!(%error, "skipped a checkpoint")).ok()?;
+        Some((folder, found))
+    })?;
+    for newer in list(run).into_iter().rev().take_while(|path| *path != folder) {
+        if let Err(error) = fs::remove_dir_all(&newer) {
+            tracing::error!(%error, path = %newer.display(), "a checkpoint that must not be used cannot be removed; remove it");
+        }
+    }
+    clean(&FileSystem, run, found.0.iteration);
+    Some(found)
 }
 
 /// `000012` and `.000012.old`: the number, and whether the folder is in its place.

@@ -5,8 +5,9 @@ use crate::run_events::StopReason;
 use crate::run_folder::{CONFIG_FILE, Claim, FolderError, RunFolderState};
 use crate::run_identity::RunIdentity;
 use crate::run_start::Parent;
+use crate::serve::judge::Compute;
 use crate::serve::service::learner_service;
-use crate::serve::validate::Limits;
+use crate::serve::validate::{Limits, RECOMPUTE};
 use crate::trainer::{TrainError, TrainOutcome, Trainer, max_shard_episodes};
 use clap::Args;
 use magex_core::config::{RunConfig, SEED_MAX};
@@ -72,6 +73,9 @@ pub struct LearnerArgs {
     /// Silence after which an actor loses its leases
     #[arg(long, env = "MAGEX_LEASE_SECONDS", default_value_t = 15.0, value_name = "SECONDS", value_parser = options::number(0.1, 3600.0))]
     pub lease_seconds: f64,
+    /// Share of the shards that are computed a second time, by another actor, to see whether the results are the same; 0: none
+    #[arg(long, env = "MAGEX_RECOMPUTE", default_value_t = RECOMPUTE, value_name = "SHARE", value_parser = options::number(0.0, 1.0))]
+    pub recompute: f64,
     /// TLS and access rules of the port.
     #[command(flatten)]
     pub security: ServerArgs,
@@ -89,8 +93,11 @@ pub struct LearnerArgs {
 /// The name of this process in the lock of a run folder.
 const COMMAND: &str = "magex learner";
 
+/// Makes what computes shards on this host, for a run's configuration: [`crate::serve::judge`].
+pub type MakeJudge = fn(&RunConfig) -> Compute;
+
 /// Trains until the run is complete or stopped. Returns the exit code.
-pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
+pub fn run(mut args: LearnerArgs, judge: MakeJudge) -> Result<u8, Failure> {
     if args.service.health_check {
         return probe::own(&args.listen, args.security.tls_cert.is_some());
     }
@@ -116,7 +123,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
         .filter(|lease| (Duration::from_millis(100)..=Duration::from_secs(3600)).contains(lease))
         .ok_or_else(|| Failure::usage(format!("--lease-seconds: {} is outside 0.1..=3600", args.lease_seconds)))?;
     let security = args.security.read(&args.listen)?;
-    let run = async |context: Context| train(context, &args, config, toml, parent, lease, security).await;
+    let run = async |context: Context| train(context, &args, config, toml, parent, lease, security, judge).await;
     let reason = match service::main("learner", 2, &args.service, run)? {
         Some(TrainOutcome::Finished(_)) => return Ok(exit::OK),
         Some(TrainOutcome::Stopped(reason)) => reason.to_string(),
@@ -127,6 +134,7 @@ pub fn run(mut args: LearnerArgs) -> Result<u8, Failure> {
 }
 
 /// Binds the port, prepares the run folder, then trains and serves; `None` if the trainer did not end in time.
+#[expect(clippy::too_many_arguments, reason = "the one caller reads them from the command line")]
 async fn train(
     mut context: Context,
     args: &LearnerArgs,
@@ -135,6 +143,7 @@ async fn train(
     parent: Option<Parent>,
     lease: Duration,
     security: Security,
+    judge: MakeJudge,
 ) -> Result<Option<TrainOutcome>, Failure> {
     // Bound first: a port that is not available must not leave a run folder behind.
     let (incoming, address) = context.listen(&args.listen, args.security.connections()).await?;
@@ -158,7 +167,9 @@ async fn train(
     };
     let live = RunInfo { name: identity.name.clone(), learner: Some(address.to_string()), lease: Some(lease) };
     let limits = Limits::for_task(&config.task, max_shard_episodes(&config) as usize);
+    let limits = Limits { recompute: args.recompute, ..limits };
     let (handle, mut collector) = learner_service(identity, limits);
+    collector.judge(judge(&config));
     trainer.observe(handle.observer());
     let sources = security.sources();
     let handle = handle.guarded(security).beating(args.security.heartbeat());

@@ -28,16 +28,19 @@ fn shape(task: &TaskConfig, episodes: usize) -> Shape {
     task.shape(episodes)
 }
 
-/// 1 is a value that every metric may have.
+/// 1 is a value that every metric may have; the reward is that of [`trajectory`].
 fn metrics(episodes: usize) -> Vec<EpisodeMetrics> {
     let mut one = EpisodeMetrics([1.0; METRICS.len()]);
-    (one[SUCCESS_RATE], one[REWARD], one[SECOND_COST_RATIO]) = (0.5, -0.2, f32::NAN);
+    (one[SUCCESS_RATE], one[REWARD], one[SECOND_COST_RATIO]) = (0.5, 0.3, f32::NAN);
     vec![one; episodes]
 }
 
 pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
     let shape = shape(task, shard.episodes as usize);
     let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
+    // Everything is at one place, so every assignment is exact.
+    let in_order: Vec<u32> = (0..n as u32).collect();
+    let cost = magex_assign::cost_of_points(&vec![0.5; 2 * n], &vec![0.2; 2 * n], 2, &in_order) as f32;
     Trajectory {
         shard,
         shape,
@@ -50,8 +53,8 @@ pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
         log_probs: vec![-1.0; t * b * n],
         rewards: vec![0.3; t * b * n],
         goal_log_probs: vec![-2.0; b],
-        costs: vec![2.0; b],
-        exact_costs: vec![1.5; b],
+        costs: vec![cost; b],
+        exact_costs: vec![cost; b],
         metrics: metrics(b),
     }
 }

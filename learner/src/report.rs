@@ -5,5 +5,6 @@ pub mod means;
 pub(crate) mod metrics_file;
 pub mod observer;
 pub mod records;
+pub(crate) mod senders;
 pub(crate) mod shard_timing;
 pub(crate) mod tensorboard;

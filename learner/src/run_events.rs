@@ -1,5 +1,6 @@
 //! Events of a run, and the reasons for which collecting or training ends.
 
+use crate::collector::Conviction;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use magex_nets::params::ParamError;
 use magex_proto::v1;
@@ -36,6 +37,24 @@ pub enum CollectError {
         /// The shard.
         shard: Shard,
         /// The reason of the last failure.
+        reason: String,
+    },
+    /// An actor is proven to compute wrong results; the results of the plan are discarded.
+    #[error(
+        "actor {} (process {:x}) sent a wrong result of {}: {} where every other computation gives {}",
+        .0.origin.actor, .0.origin.process, describe(&.0.shard), .0.origin.digest, .0.digest
+    )]
+    Convicted(Box<Conviction>),
+    /// Two actors disagree, and this host cannot find out which of them is right.
+    #[error("{} has two different results, from {first} and {second}, and cannot be computed here: {reason}", describe(.shard))]
+    Undecided {
+        /// The shard.
+        shard: Shard,
+        /// Name of one actor.
+        first: String,
+        /// Name of the other.
+        second: String,
+        /// Why this host cannot compute it.
         reason: String,
     },
     /// The plan has no shards.

@@ -5,6 +5,7 @@
 pub(crate) mod control;
 pub(crate) mod events;
 pub mod grpc_collector;
+pub mod judge;
 pub(crate) mod ledger;
 pub(crate) mod lock_order;
 pub(crate) mod metrics;
@@ -14,6 +15,8 @@ pub(crate) mod roster;
 pub mod service;
 pub(crate) mod session;
 pub(crate) mod shared;
+#[cfg(test)]
+mod simulation;
 pub(crate) mod status;
 pub mod validate;
 pub mod weights_board;

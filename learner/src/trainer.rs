@@ -6,6 +6,7 @@ mod outcome;
 mod plan;
 mod saving;
 mod target;
+mod trust;
 
 use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
@@ -13,22 +14,23 @@ pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
 use crate::checkpoint::disk::{Disk, FileSystem, Place, replace_file};
 use crate::checkpoint::{self, CheckpointError, Progress};
-use crate::collector::Collector;
+use crate::collector::{Collector, Origin};
 use crate::report::means::{EvalSummary, IterationMeans, summarise};
 use crate::report::metrics_file::{MetricsFile, ranges};
 use crate::report::observer::{FileError, RunObserver, RunStart};
 use crate::report::records::{IterationMetrics, Summary, Timing};
+use crate::report::senders::SendersFile;
 use crate::report::tensorboard::EventFile;
-use crate::run_events::{CollectError, RunEvent, parse_report};
+use crate::run_events::{RunEvent, parse_report};
 use crate::run_folder::CONFIG_FILE;
 use crate::run_start::{Changes, Parent, continued};
-use crate::train::algorithm::Algorithm;
+use crate::train::algorithm::{Algorithm, UpdateError};
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::replay::Replay;
 use crate::train::stats::UpdateStats;
 use magex_core::config::RunConfig;
-use magex_core::ids::{Mode, RunId, Shard, WeightsVersion};
+use magex_core::ids::{Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::sha256;
 use magex_core::trajectory::{EvalOutcome, ShardResult, Trajectory};
@@ -39,6 +41,7 @@ use magex_viewer::page::{Phase, RunEnd};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
+use trust::Collected;
 
 /// Evaluations in a row that must reach the target.
 const EVALUATIONS_ON_TARGET: u32 = 2;
@@ -68,6 +71,10 @@ pub struct Trainer {
     missing_lines: Vec<u32>,
     /// Checkpoints that could not be written, in a row.
     failed_checkpoints: u32,
+    /// Updates that failed because of their results, in a row.
+    refused: u32,
+    /// The first iteration that the run may have to go back to.
+    unconfirmed_since: Option<u32>,
 }
 
 impl Trainer {
@@ -112,6 +119,7 @@ impl Trainer {
         let (metrics, events) = (MetricsFile::create(trainer.disk.clone(), place())?, EventFile::new(place(), None));
         trainer.observe(metrics);
         trainer.observe(events);
+        trainer.observe(SendersFile::open(folder, 0));
         trainer.checkpoint()?;
         Ok(trainer)
     }
@@ -166,6 +174,7 @@ impl Trainer {
             trainer.missing_lines = missing;
             trainer.observe(metrics);
             trainer.observe(events);
+            trainer.observe(SendersFile::open(folder, progress.iteration));
         }
         let completed = (progress.iteration, progress.joint_env_steps);
         trainer.before = MetricsFile::last_line(folder).and_then(|line| parse_report(line, completed));
@@ -245,6 +254,8 @@ impl Trainer {
             before: None,
             missing_lines: Vec::new(),
             failed_checkpoints: 0,
+            refused: 0,
+            unconfirmed_since: None,
         })
     }
 
@@ -315,14 +326,16 @@ impl Trainer {
             let train = iteration < self.config.max_iterations();
             let plan = self.plan(train);
             self.notify(|observer| observer.phase(if train { Phase::Collecting } else { Phase::Evaluating }));
-            let results = match collector.collect(plan) {
-                Err(CollectError::Stopped(reason)) => {
+            let results = match self.collect(collector, plan)? {
+                Collected::Results(results) => results,
+                Collected::Stopped(reason) => {
                     // The iteration was not collected; a resume repeats it from the last complete one.
                     self.save();
                     return Ok(TrainOutcome::Stopped(reason));
                 }
-                other => other?,
+                Collected::Again => continue,
             };
+            let shards: Vec<Shard> = results.iter().map(|result| *result.shard()).collect();
             timing.collect_s = clock.elapsed().as_secs_f64();
             let (trajectories, outcomes) = split(results);
 
@@ -330,12 +343,31 @@ impl Trainer {
             let episodes = IterationMeans { greedy: self.evaluated(&outcomes), sampled };
             let on_target = self.on_target(&episodes);
             let target_reached = on_target >= EVALUATIONS_ON_TARGET;
+            if on_target > self.progress.on_target {
+                // The end of the run depends on these results, and on nothing else.
+                let sampled = self.config.run.target_sampled_success > 0.0;
+                let decisive = shards.iter().filter(|shard| sampled || shard.kind == ShardKind::Eval).copied();
+                match self.confirm(collector, &decisive.collect::<Vec<_>>())? {
+                    Collected::Results(_) => {}
+                    Collected::Stopped(reason) => {
+                        self.save();
+                        return Ok(TrainOutcome::Stopped(reason));
+                    }
+                    Collected::Again => continue,
+                }
+            }
             if target_reached || !train {
                 self.record(collector, episodes, timing, None)?;
-                return self.finish(collector, target_reached);
+                match self.finish(collector, target_reached)? {
+                    Some(outcome) => return Ok(outcome),
+                    None => continue,
+                }
             }
 
-            let updates = self.update(&trajectories, &mut timing)?;
+            let Some(updates) = self.update_or_refuse(collector, &trajectories, &mut timing)? else { continue };
+            let senders: Vec<(Shard, Origin)> = shards.into_iter().zip(collector.origins().iter().cloned()).collect();
+            self.notify(|observer| observer.senders(iteration, &senders));
+            self.unconfirmed_since = collector.unconfirmed_since();
             // The line stands at the version that was evaluated and rolled out, and at the steps that it had seen: the update
             // leads to the next one. It precedes the checkpoint: after a kill in between, a resume truncates it and repeats the
             // iteration.
@@ -397,7 +429,7 @@ impl Trainer {
         &mut self,
         trajectories: &[Trajectory],
         timing: &mut Timing,
-    ) -> Result<(UpdateStats, CommanderStats), TrainError> {
+    ) -> Result<(UpdateStats, CommanderStats), UpdateError> {
         self.notify(|observer| observer.phase(Phase::Training));
         let _span = tracing::info_span!(target: trace::TARGET, "update").entered();
         let iteration = self.progress.iteration;

@@ -4,7 +4,7 @@
 use magex_commander::run_scheduler::load_scheduler;
 use magex_commander::service::ServiceConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
-use magex_core::metrics_table::METRICS;
+use magex_core::metrics_table::{METRICS, REWARD};
 use magex_core::statics::Statics;
 use magex_core::trajectory::{EpisodeMetrics, ShardResult, Trajectory};
 use magex_proto::convert::encode_result;
@@ -126,8 +126,11 @@ fn trajectory(run: &Run) -> ShardResult {
     };
     let shape = task.shape(2);
     let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
-    // A value that every metric may have.
-    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
+    // A value that every metric may have. All agents are at one place, so every assignment is exact.
+    let mut metrics = EpisodeMetrics([1.0; METRICS.len()]);
+    metrics[REWARD] = 0.3;
+    let in_order: Vec<u32> = (0..n as u32).collect();
+    let cost = magex_assign::cost_of_points(&vec![0.5; 2 * n], &vec![0.1; 2 * n], 2, &in_order) as f32;
     ShardResult::Train(Trajectory {
         shard,
         shape,
@@ -140,8 +143,8 @@ fn trajectory(run: &Run) -> ShardResult {
         log_probs: vec![-1.0; t * b * n],
         rewards: vec![0.3; t * b * n],
         goal_log_probs: vec![-1.0; b],
-        costs: vec![2.0; b],
-        exact_costs: vec![1.0; b],
+        costs: vec![cost; b],
+        exact_costs: vec![cost; b],
         metrics: vec![metrics; b],
     })
 }

@@ -90,7 +90,9 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
                 config.mappo.epochs = epochs;
                 let mappo = Mappo::new(&config)?;
                 let mut learned = Learned { networks: mappo.init()?, value_norm: mappo.value_norm(), replay: None };
-                let batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
+                let mut batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
+                // The update refuses those of another policy.
+                batch.log_probs = mappo.log_probs(&learned, &batch)?;
                 let clock = Instant::now();
                 mappo.update(&mut learned, &batch, 0, 0.0)?;
                 // The first round warms the caches.

@@ -44,6 +44,9 @@ pub enum Purpose {
     Controller = 15,
     /// Which episodes of the replay buffer a gradient step takes; indices: iteration, gradient step.
     Replay = 16,
+    /// Which shards are computed a second time; keyed by a secret of the learner's process, because no number of a run depends
+    /// on it; indices: iteration, shard, kind, evaluation set.
+    Recompute = 17,
     /// Resamples of the bootstrap; indices: resample, system, task.
     Bootstrap = 31,
 }

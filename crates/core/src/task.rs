@@ -3,6 +3,7 @@
 //! A task is one [`TaskName`], one variant of [`TaskSettings`] and one file (`task/<name>.rs`) with a `Definition`;
 //! its physics is in `magex-env`. Everything between (networks, actors, learner, commander) reads the answers given here.
 
+mod bounds;
 mod definition;
 mod drones;
 mod observation;
@@ -18,6 +19,7 @@ use crate::{sha256, toml_table};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+pub use bounds::Bounds;
 pub use definition::Definition;
 pub use drones::{Downwash, DroneConfig};
 pub use observation::{Frame, Observation};

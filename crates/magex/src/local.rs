@@ -9,6 +9,7 @@ use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use magex_learner::collector::Collector;
 use magex_learner::run_events::{CollectError, StopReason};
+use magex_learner::serve::judge::Compute;
 use magex_nets::commander::Commander;
 use magex_nets::params::ParamError;
 use magex_proto::weights::Weights;
@@ -64,6 +65,20 @@ pub fn commander(
         Some(classical) => Ok(classical),
         None => Commander::load(&chosen, config.task.agents, config.task.dims(), weights),
     }
+}
+
+/// Computes single shards as actors and commander together do: for a learner whose actors disagree.
+pub(crate) fn judge(config: &RunConfig) -> Compute {
+    let (config, mut loaded) = (config.clone(), None::<(String, LoadedPolicy)>);
+    Box::new(move |shard, weights| {
+        let policy = match loaded.take() {
+            Some((sha256, policy)) if sha256 == weights.sha256 => policy,
+            _ => LoadedPolicy::new(&config, &weights.bytes).map_err(|error| error.to_string())?,
+        };
+        let (_, policy) = loaded.insert((weights.sha256.clone(), policy));
+        let results = policy.rollout_all(std::slice::from_ref(shard), 1, |_| {}).map_err(|error| error.to_string())?;
+        results.into_iter().next().ok_or_else(|| "no result".to_owned())
+    })
 }
 
 /// A [`Collector`] whose actors are threads of this process.

@@ -23,6 +23,13 @@ impl Health {
         (health, server)
     }
 
+    /// Sets a part of the service's health that has a name of its own. It does not change that of the service: a service that
+    /// orchestrators take out of use cannot recover.
+    pub async fn set_part(&self, name: &'static str, serving: bool) {
+        let status = if serving { ServingStatus::Serving } else { ServingStatus::NotServing };
+        self.reporter.set_service_status(name, status).await;
+    }
+
     /// Sets SERVING or NOT_SERVING.
     pub async fn set(&self, serving: bool) {
         let status = if serving { ServingStatus::Serving } else { ServingStatus::NotServing };

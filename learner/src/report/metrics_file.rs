@@ -157,6 +157,14 @@ impl RunObserver for MetricsFile {
         }
     }
 
+    fn went_back(&mut self, iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
+        let mut waiting = std::mem::take(&mut self.waiting);
+        waiting.retain(|line| number(line).is_some_and(|number| number < iteration));
+        (*self, _) = Self::reopen(self.disk.clone(), self.place.clone(), iteration)?;
+        self.waiting = waiting;
+        Ok(())
+    }
+
     fn sync(&mut self) -> Result<(), FileError> {
         let synced = self.disk.sync(&self.path).and_then(|()| match self.fresh {
             true => self.disk.sync(self.place.folder()),

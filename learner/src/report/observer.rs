@@ -1,8 +1,9 @@
 //! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
 
+use crate::collector::Origin;
 use crate::report::records::IterationMetrics;
 use crate::run_events::RunEvent;
-use magex_core::ids::RunId;
+use magex_core::ids::{RunId, Shard};
 use magex_core::trajectory::EvalOutcome;
 use magex_proto::v1::IterationEvent;
 use magex_proto::weights::Weights;
@@ -53,6 +54,17 @@ pub trait RunObserver: Debug + Send {
 
     /// An evaluation was collected.
     fn evaluated(&mut self, _outcomes: &[EvalOutcome]) {}
+
+    /// An iteration is going to be trained on these results of actors.
+    fn senders(&mut self, _iteration: u32, _results: &[(Shard, Origin)]) {}
+
+    /// The run went back to a checkpoint of `iteration` iterations and so many joint steps: what is later did not happen.
+    ///
+    /// # Errors
+    /// A file cannot be cut back.
+    fn went_back(&mut self, _iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
+        Ok(())
+    }
 
     /// An iteration is complete. `report` has its line of metrics.jsonl; [`Self::event`] receives it next.
     fn iteration(&mut self, _metrics: &IterationMetrics, _report: &IterationEvent) {}

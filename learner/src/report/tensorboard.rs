@@ -148,6 +148,13 @@ impl RunObserver for EventFile {
     fn iteration(&mut self, _metrics: &IterationMetrics, report: &IterationEvent) {
         self.append(&report.metrics_json, report.joint_env_steps);
     }
+
+    /// Another file, as after a resume.
+    fn went_back(&mut self, _iteration: u32, joint_env_steps: u64) -> Result<(), FileError> {
+        self.waiting.retain(|(step, _)| *step < joint_env_steps);
+        (self.resumed, self.begun, self.open) = (Some(joint_env_steps), false, None);
+        Ok(())
+    }
 }
 
 /// Creates the next file, with the records that every file begins with.

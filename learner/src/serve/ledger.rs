@@ -3,13 +3,29 @@
 //! The learner opens a plan (the shards of an iteration). Actors lease shards and complete them in any order and any number
 //! of times. The results come out in the order of the plan, each exactly once. Every lease ends in exactly one way, and so do
 //! the episodes of its shard: leased = trained + duplicate + expired + rejected + failed + outstanding.
+//!
+//! A shard has more than one lease at a time in two cases. *Hedged:* the queue is empty, an actor is idle, and a lease is late:
+//! the shard is leased to the idle actor too, and the first result counts. *Checked:* a result is confirmed by a second
+//! computation ([`checks`]).
 
+pub(crate) mod checks;
+mod late;
+mod pace;
+mod totals;
+
+use self::checks::{Checks, Sampling};
+use self::pace::Pace;
+pub(crate) use self::totals::Counters;
+use self::totals::{DUPLICATE, EXPIRED, FAILED, REJECTED, TRAINED, Totals, balanced};
+use crate::collector::Origin;
 use crate::run_events::CollectError;
 use magex_core::error::FieldError;
-use magex_core::ids::Shard;
+use magex_core::ids::{Shard, ShardKind};
 use magex_core::trajectory::ShardResult;
-use magex_proto::v1::{LedgerStatus, Verdict};
+use magex_proto::v1::Verdict;
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::time::Duration;
+use tokio::time::Instant;
 
 /// Permanent (not retryable) failures before a shard is given up or an actor is evicted.
 pub(crate) const MAX_FAILURES: u32 = 3;
@@ -27,43 +43,20 @@ pub(crate) struct Lease {
     pub(crate) shard: Shard,
 }
 
-/// Totals of the leases so far, by how they ended: of shards, or of their episodes. `leased` includes late results of leases
-/// that the ledger no longer knows.
-pub(crate) type Counters = LedgerStatus;
-
-/// The total that a lease is counted in when it ends.
-type Fate = fn(&mut Counters) -> &mut u64;
-
-const TRAINED: Fate = |totals| &mut totals.trained;
-const DUPLICATE: Fate = |totals| &mut totals.duplicate;
-const EXPIRED: Fate = |totals| &mut totals.expired;
-const REJECTED: Fate = |totals| &mut totals.rejected;
-const FAILED: Fate = |totals| &mut totals.failed;
-
-/// Totals of shards and of episodes, counted together so that neither can be forgotten.
-#[derive(Debug, Default)]
-struct Totals {
-    shards: Counters,
-    episodes: Counters,
+/// A session that has room for a shard.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Asker {
+    pub(crate) session: SessionId,
+    /// Id of the actor's process.
+    pub(crate) process: u64,
+    pub(crate) now: Instant,
 }
 
-impl Totals {
-    fn leased(&mut self, episodes: u32) {
-        self.shards.leased += 1;
-        self.episodes.leased += u64::from(episodes);
-    }
-
-    fn ended(&mut self, fate: Fate, episodes: u32) {
-        *fate(&mut self.shards) += 1;
-        *fate(&mut self.episodes) += u64::from(episodes);
-    }
-}
-
-/// Totals with what is held now and what is left over, which is always zero: every lease ends in exactly one way.
-fn balanced(totals: Counters, outstanding: u64) -> Counters {
-    let Counters { leased, trained, duplicate, expired, rejected, failed, .. } = totals;
-    let ended = trained + duplicate + expired + rejected + failed + outstanding;
-    Counters { outstanding, residual: leased.wrapping_sub(ended).cast_signed(), ..totals }
+/// A late lease, for the log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct OldestLease {
+    pub(crate) shard: Shard,
+    pub(crate) since: Instant,
 }
 
 /// A permanent failure of a shard: the actor reports that a retry would fail too.
@@ -80,15 +73,22 @@ pub(crate) struct ShardFailure<'a> {
 #[derive(Debug)]
 struct Slot {
     shard: Shard,
-    result: Option<ShardResult>,
+    result: Option<(ShardResult, Origin)>,
     queued: bool,
     leases: u32,
     failures: u32,
     /// Processes and names of the actors at which it failed permanently.
     failed_at: Vec<(u64, String)>,
+    /// Processes that gave it back.
+    given_back: Vec<u64>,
 }
 
 impl Slot {
+    /// Whether it is kept for others that have room: this process gave it back, and one of them has not.
+    fn avoids(&self, process: u64, others: impl FnOnce() -> Vec<u64>) -> bool {
+        self.given_back.contains(&process) && others().iter().any(|other| !self.given_back.contains(other))
+    }
+
     /// Records a permanent failure. Returns whether the shard is at fault rather than the actor: it failed at
     /// [`MAX_FAILURES`] different actors, or at every connected one. A restarted process with the same name is the same actor.
     fn fail(&mut self, failure: &ShardFailure<'_>) -> bool {
@@ -105,10 +105,12 @@ impl Slot {
 #[derive(Debug, Clone, Copy)]
 struct HeldLease {
     session: SessionId,
+    process: u64,
     shard: Shard,
+    since: Instant,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Ledger {
     next_lease: u64,
     plan: Vec<Slot>,
@@ -119,12 +121,31 @@ pub(crate) struct Ledger {
     totals: Totals,
     /// A shard that fails at every actor, and the reason of its last failure.
     given_up: Option<(Shard, String)>,
+    pace: Pace,
+    /// Whether a late shard may be leased again before its lease has expired: right for pure shards only.
+    pub(crate) hedges: bool,
+    pub(crate) checks: Checks,
+    /// Grows when there may be something new to lease.
+    offers: u64,
 }
 
 impl Ledger {
-    /// An empty ledger whose leases are numbered from `first_lease`.
-    pub(crate) fn new(first_lease: u64) -> Self {
-        Self { next_lease: first_lease, ..Self::default() }
+    /// An empty ledger whose leases are numbered from `first_lease`. `lease` is the silence after which an actor loses its own.
+    pub(crate) fn new(first_lease: u64, lease: Duration, sampling: Sampling) -> Self {
+        Self {
+            next_lease: first_lease,
+            plan: Vec::new(),
+            position: HashMap::new(),
+            queue: VecDeque::new(),
+            held: BTreeMap::new(),
+            done: 0,
+            totals: Totals::default(),
+            given_up: None,
+            pace: Pace::new(lease),
+            hedges: true,
+            checks: Checks::new(sampling),
+            offers: 0,
+        }
     }
 
     /// Opens a plan; the one before must have been taken or abandoned.
@@ -143,28 +164,61 @@ impl Ledger {
         }
         self.queue = (0..plan.len()).collect();
         self.position = position;
-        let slot = |shard| Slot { shard, result: None, queued: true, leases: 0, failures: 0, failed_at: Vec::new() };
+        let slot = |shard| Slot {
+            shard,
+            result: None,
+            queued: true,
+            leases: 0,
+            failures: 0,
+            failed_at: Vec::new(),
+            given_back: Vec::new(),
+        };
         self.plan = plan.into_iter().map(slot).collect();
         self.done = 0;
         self.given_up = None;
+        self.offers += 1;
         Ok(())
     }
 
-    pub(crate) fn lease(&mut self, session: SessionId) -> Option<Lease> {
-        loop {
-            let at = self.queue.pop_front()?;
-            let slot = &mut self.plan[at];
-            slot.queued = false;
-            if slot.result.is_some() {
-                continue;
-            }
-            slot.leases += 1;
-            let lease = Lease { id: LeaseId(self.next_lease), shard: slot.shard };
-            self.next_lease = self.next_lease.wrapping_add(1);
-            self.held.insert(lease.id, HeldLease { session, shard: lease.shard });
-            self.totals.leased(lease.shard.episodes);
+    /// The next shard for an actor: one to compute a second time, else one from the queue, else one whose lease is late.
+    /// `others` are the processes of other actors that have room.
+    pub(crate) fn lease(&mut self, asker: Asker, others: impl Fn() -> Vec<u64>) -> Option<Lease> {
+        if let Some(shard) = self.checks.next(&asker, |shard| self.pace.late(shard.kind)) {
+            let lease = self.grant(&asker, shard);
+            self.checks.leased(lease.id, &shard, &asker);
             return Some(lease);
         }
+        let at = self.queued_for(asker.process, &others).or_else(|| self.late_for(&asker, &others))?;
+        self.plan[at].leases += 1;
+        Some(self.grant(&asker, self.plan[at].shard))
+    }
+
+    fn grant(&mut self, asker: &Asker, shard: Shard) -> Lease {
+        let lease = Lease { id: LeaseId(self.next_lease), shard };
+        self.next_lease = self.next_lease.wrapping_add(1);
+        let Asker { session, process, now: since } = *asker;
+        self.held.insert(lease.id, HeldLease { session, process, shard, since });
+        self.totals.leased(shard.episodes);
+        lease
+    }
+
+    /// Takes the first shard of the queue that this process may have.
+    fn queued_for(&mut self, process: u64, others: &impl Fn() -> Vec<u64>) -> Option<usize> {
+        let mut place = 0;
+        while let Some(&at) = self.queue.get(place) {
+            let slot = &mut self.plan[at];
+            let done = slot.result.is_some();
+            if !done && slot.avoids(process, others) {
+                place += 1;
+                continue;
+            }
+            slot.queued = false;
+            self.queue.remove(place);
+            if !done {
+                return Some(at);
+            }
+        }
+        None
     }
 
     /// Accepts a valid result, unless the shard is complete already or belongs to no open plan: that is a duplicate. A result
@@ -178,25 +232,44 @@ impl Ledger {
         session: SessionId,
         lease: LeaseId,
         result: ShardResult,
+        (origin, now): (Origin, Instant),
     ) -> Result<Verdict, FieldError> {
         let shard = *result.shard();
         if self.held_by(session, lease).is_some_and(|held| held.shard != shard) {
             self.reject(session, lease);
             return Err(FieldError::new("shard", "not the one that was leased"));
         }
-        if self.release(session, lease).is_none() {
-            self.totals.leased(shard.episodes);
+        match self.release(session, lease) {
+            Some(held) => self.pace.took(shard.kind, now.saturating_duration_since(held.since)),
+            None => self.totals.leased(shard.episodes),
         }
         match self.position.get(&shard).map(|&at| &mut self.plan[at]) {
             Some(slot) if slot.result.is_none() => {
-                slot.result = Some(result);
+                self.offers += u64::from(self.checks.accepted(&shard, &origin, now));
+                slot.result = Some((result, origin));
                 self.done += 1;
                 self.totals.ended(TRAINED, shard.episodes);
                 Ok(Verdict::Accepted)
             }
-            _ => {
+            slot => {
+                let known = slot.and_then(|slot| slot.result.as_ref()).map(|(_, origin)| origin);
+                self.checks.compare(&shard, known, &origin, now);
                 self.totals.ended(DUPLICATE, shard.episodes);
                 Ok(Verdict::Duplicate)
+            }
+        }
+    }
+
+    /// Drops a result that was made with weights which the run has gone back on. Its shard is queued again if it is wanted.
+    pub(crate) fn withdraw(&mut self, session: SessionId, lease: LeaseId) {
+        match self.release(session, lease) {
+            Some(held) => {
+                self.totals.ended(DUPLICATE, held.shard.episodes);
+                self.requeue(held.shard, true);
+            }
+            None => {
+                self.totals.leased(0);
+                self.totals.ended(DUPLICATE, 0);
             }
         }
     }
@@ -213,12 +286,18 @@ impl Ledger {
         }
     }
 
-    /// Returns a lease from an actor that cannot process it now; the shard is queued at the end.
-    pub(crate) fn give_back(&mut self, session: SessionId, lease: LeaseId) {
-        if let Some(held) = self.release(session, lease) {
-            self.totals.ended(FAILED, held.shard.episodes);
-            self.requeue(held.shard, false);
+    /// Returns a lease from an actor that cannot process it now; the shard is queued at the end, and others get it first. False
+    /// if the session does not hold it.
+    pub(crate) fn give_back(&mut self, session: SessionId, lease: LeaseId) -> bool {
+        let Some(held) = self.release(session, lease) else { return false };
+        self.totals.ended(FAILED, held.shard.episodes);
+        if let Some(&at) = self.position.get(&held.shard) {
+            let given_back = &mut self.plan[at].given_back;
+            given_back.retain(|process| *process != held.process);
+            given_back.push(held.process);
         }
+        self.requeue(held.shard, false);
+        true
     }
 
     /// Returns a lease that failed permanently; false if the session does not hold it. The shard is given up after failing at
@@ -250,7 +329,7 @@ impl Ledger {
     }
 
     /// Closes a complete plan and returns its results in the order of the plan.
-    pub(crate) fn take(&mut self) -> Option<Vec<ShardResult>> {
+    pub(crate) fn take(&mut self) -> Option<Vec<(ShardResult, Origin)>> {
         if !self.is_complete() {
             return None;
         }
@@ -265,8 +344,41 @@ impl Ledger {
         self.close();
     }
 
+    /// Whether every shard is done, and so are the checks of earlier plans: their weights are gone when the next plan opens.
     pub(crate) fn is_complete(&self) -> bool {
+        let iteration = self.plan.first().map_or(0, |slot| slot.shard.iteration.0);
+        self.all_done() && !self.checks.open_before(iteration)
+    }
+
+    /// Whether every shard is done.
+    pub(crate) fn all_done(&self) -> bool {
         !self.plan.is_empty() && self.done == self.plan.len()
+    }
+
+    /// Grows when there may be something new to lease.
+    pub(crate) fn offers(&self) -> u64 {
+        self.offers
+    }
+
+    /// Says that there may be something new to lease.
+    pub(crate) fn offer(&mut self) {
+        self.offers += 1;
+    }
+
+    /// Age from which a lease is late.
+    pub(crate) fn late(&self, kind: ShardKind) -> Duration {
+        self.pace.late(kind)
+    }
+
+    /// Age from which a lease is worth a line in the log.
+    pub(crate) fn stalled(&self, kind: ShardKind) -> Duration {
+        self.pace.stalled(kind)
+    }
+
+    /// The oldest lease of a session.
+    pub(crate) fn oldest_of(&self, session: SessionId) -> Option<OldestLease> {
+        let own = self.held.values().filter(|held| held.session == session);
+        own.min_by_key(|held| held.since).map(|held| OldestLease { shard: held.shard, since: held.since })
     }
 
     /// Shards done, and shards of the open plan.
@@ -308,6 +420,7 @@ impl Ledger {
     fn release(&mut self, session: SessionId, lease: LeaseId) -> Option<HeldLease> {
         self.held_by(session, lease)?;
         let held = self.held.remove(&lease)?;
+        self.checks.released(lease);
         if let Some(&at) = self.position.get(&held.shard) {
             // A lease of an abandoned plan may name a shard that a later plan names again.
             self.plan[at].leases = self.plan[at].leases.saturating_sub(1);
@@ -316,6 +429,8 @@ impl Ledger {
     }
 
     fn requeue(&mut self, shard: Shard, front: bool) {
+        // Even if it is not queued, it may be late for another actor now, or its check may be open again.
+        self.offers += 1;
         let Some(&at) = self.position.get(&shard) else { return };
         let slot = &mut self.plan[at];
         if slot.result.is_some() || slot.queued || slot.leases > 0 {

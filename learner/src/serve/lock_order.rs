@@ -4,6 +4,7 @@ use magex_runtime::sync::lock;
 use std::cell::Cell;
 use std::ops::{Deref, DerefMut};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// Position in the order: a thread that holds a lock may take only locks of higher rank.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,6 +52,14 @@ impl<T> OrderedGuard<'_, T> {
     pub(crate) fn wait(self, condvar: &Condvar) -> Self {
         let Self { guard, _held } = self;
         Self { guard: condvar.wait(guard).unwrap_or_else(PoisonError::into_inner), _held }
+    }
+}
+
+impl<T> OrderedGuard<'_, T> {
+    pub(crate) fn wait_timeout(self, condvar: &Condvar, limit: Duration) -> Self {
+        let Self { guard, _held } = self;
+        let (guard, _) = condvar.wait_timeout(guard, limit).unwrap_or_else(PoisonError::into_inner);
+        Self { guard, _held }
     }
 }
 

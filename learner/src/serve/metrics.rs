@@ -3,6 +3,7 @@
 use crate::report::bottleneck::{Bottleneck, Stage};
 use crate::report::records::IterationMetrics;
 use crate::serve::ledger::Counters;
+use crate::serve::ledger::checks::CheckTotals;
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
 use magex_core::trajectory::ShardResult;
 use magex_proto::v1::SubscriberRole;
@@ -15,6 +16,12 @@ use std::time::Duration;
 pub(crate) struct LearnerMetrics {
     shards: LeaseMetrics,
     episodes: LeaseMetrics,
+    checks: IntCounterVec,
+    rejections: IntCounterVec,
+    pub(crate) oldest_lease: GaugeVec,
+    pub(crate) hand_backs: GaugeVec,
+    pub(crate) since_progress: Gauge,
+    pub(crate) rolled_back: IntCounter,
     pub(crate) received_bytes: IntCounter,
     joint_steps: IntCounter,
     agent_steps: IntCounter,
@@ -46,11 +53,55 @@ pub(crate) const ENDS: [&str; 5] = ["left", "silent", "replaced", "closing", "re
 /// Parts of an iteration; the label of a metric.
 const PHASES: [&str; 5] = ["publish", "collect", "executor", "commander", "checkpoint"];
 
+/// What a second computation of a shard gave; the label of a metric.
+const CHECKS: [&str; 3] = ["same", "different", "given_up"];
+/// What rejected a result; the label of a metric.
+const REJECTIONS: [&str; 4] = ["damaged", "receipt", "update", "recomputed"];
+
+/// What rejected a result, in the order of [`REJECTIONS`].
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Rejection {
+    /// It did not arrive as it was sent.
+    Damaged,
+    /// The check on receipt: shape, range, consistency.
+    Receipt,
+    /// The update: it is not what the weights give.
+    Update,
+    /// A second computation.
+    Recomputed,
+}
+
 impl LearnerMetrics {
     pub(crate) fn new(m: &Metrics) -> Self {
         let metrics = Self {
             shards: LeaseMetrics::new(m, "shards", "Shards"),
             episodes: LeaseMetrics::new(m, "episodes", "Episodes"),
+            checks: m.counters(
+                "magex_learner_checks_total",
+                "Shards computed a second time, by what the comparison gave.",
+                &["outcome"],
+            ),
+            rejections: m.counters(
+                "magex_learner_rejections_total",
+                "Results rejected, by the check that did it.",
+                &["check"],
+            ),
+            oldest_lease: m.gauges(
+                "magex_learner_oldest_lease_seconds",
+                "Age of the oldest lease that an actor holds.",
+                &["actor"],
+            ),
+            hand_backs: m.gauges(
+                "magex_learner_hand_backs",
+                "Leases that an actor gave back in a row; from 2 on it is asked rarely.",
+                &["actor"],
+            ),
+            since_progress: m.gauge(
+                "magex_learner_since_progress_seconds",
+                "Since the last result was accepted or the last iteration ended; 0 after the end of the run.",
+            ),
+            rolled_back: m
+                .counter("magex_learner_roll_backs_total", "Returns to an earlier checkpoint after a conviction."),
             received_bytes: m.counter("magex_learner_received_bytes_total", "Bytes of results received."),
             joint_steps: m.counter("magex_learner_joint_steps_total", "Joint steps accepted into training batches."),
             agent_steps: m.counter("magex_learner_agent_steps_total", "Agent steps accepted into training batches."),
@@ -115,13 +166,22 @@ impl LearnerMetrics {
         for role in [SubscriberRole::Actor, SubscriberRole::Commander, SubscriberRole::Observer] {
             metrics.subscribers.with_label_values(&[role_name(role)]).set(0.0);
         }
+        CHECKS.iter().for_each(|outcome| metrics.checks.with_label_values(&[outcome]).inc_by(0));
+        REJECTIONS.iter().for_each(|check| metrics.rejections.with_label_values(&[check]).inc_by(0));
         set_stats(&metrics.policy_lag, &[]);
         set_stats(&metrics.sample_age, &[]);
         metrics
     }
 
+    pub(crate) fn rejected(&self, check: Rejection) {
+        self.rejections.with_label_values(&[REJECTIONS[check as usize]]).inc();
+    }
+
     /// Sets the metrics of the ledger. Called under its lock.
-    pub(crate) fn ledger(&self, shards: &Counters, episodes: &Counters, queued: usize) {
+    pub(crate) fn ledger(&self, shards: &Counters, episodes: &Counters, queued: usize, checks: &CheckTotals) {
+        for (outcome, total) in CHECKS.iter().zip([checks.same, checks.different, checks.given_up]) {
+            raise_to(&self.checks.with_label_values(&[outcome]), total);
+        }
         self.shards.set(shards);
         self.episodes.set(episodes);
         self.queue("shards", queued);

@@ -7,8 +7,10 @@ use magex_proto::v1;
 use magex_runtime::status;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tokio::sync::mpsc::WeakSender;
+use tokio::sync::watch;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -26,6 +28,12 @@ pub(crate) struct ActorEntry {
     pub(crate) last_seen: Instant,
     /// Ends the session: the same process has connected again.
     pub(crate) replaced: CancellationToken,
+    /// Ends the session with this reason: the actor is sent away.
+    pub(crate) sent_away: watch::Sender<Option<String>>,
+    /// Whether it would take another lease.
+    pub(crate) has_room: bool,
+    /// Leases given back in a row.
+    pub(crate) hand_backs: u32,
     pub(crate) outbound: WeakSender<Result<v1::RolloutResponse, Status>>,
 }
 
@@ -124,6 +132,22 @@ impl Roster {
 
     pub(crate) fn evict(&self, process_id: u64) {
         self.members.lock().evict(process_id);
+    }
+
+    /// [`Self::evict`], and ends the process's session if it has one.
+    pub(crate) fn send_away(&self, process_id: u64, reason: &str) {
+        let mut members = self.members.lock();
+        members.evict(process_id);
+        for actor in members.connected.values().filter(|actor| actor.process_id == process_id) {
+            actor.sent_away.send_replace(Some(reason.to_owned()));
+        }
+    }
+
+    /// Processes of other actors that would take a lease.
+    pub(crate) fn with_room(&self, except: u64) -> Vec<u64> {
+        let members = self.members.lock();
+        let others = members.connected.values().filter(|actor| actor.has_room && actor.process_id != except);
+        others.map(|actor| actor.process_id).collect()
     }
 
     /// [`Self::evict`], unless no other process is connected. An evicted process stops counting immediately, so that

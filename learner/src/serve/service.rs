@@ -4,6 +4,7 @@ use crate::report::bottleneck::CollectTiming;
 use crate::run_events::StopReason;
 use crate::run_identity::RunIdentity;
 use crate::serve::grpc_collector::GrpcCollector;
+use crate::serve::judge::Judge;
 use crate::serve::observer::ServiceObserver;
 use crate::serve::session;
 use crate::serve::shared::Shared;
@@ -21,6 +22,7 @@ use magex_runtime::net::in_flight::{InFlight, InFlightLimits};
 use magex_runtime::security::Security;
 use magex_runtime::server::{self, Incoming};
 use magex_runtime::status;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -30,6 +32,12 @@ use tonic::{Request, Response, Result, Streaming};
 
 /// Default time of a lease.
 pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
+
+/// The part of the learner's health that says whether shards get done.
+pub const PROGRESS: &str = "progress";
+
+/// How often the learner looks whether they do.
+const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 
 const STREAMS: &[&str] = &["Rollout", "WatchWeights", "WatchRun"];
 
@@ -45,7 +53,14 @@ pub fn learner_service(run: RunIdentity, limits: Limits) -> (LearnerHandle, Grpc
             shared.refresh_gauges();
         }
     });
-    let collector = GrpcCollector { shared: shared.clone(), timing: CollectTiming::default() };
+    let collector = GrpcCollector {
+        shared: shared.clone(),
+        timing: CollectTiming::default(),
+        judge: Judge::default(),
+        shards: Vec::new(),
+        origins: Vec::new(),
+        unconfirmed: BTreeMap::new(),
+    };
     (LearnerHandle { shared, security: Security::default(), heartbeat: None }, collector)
 }
 
@@ -99,6 +114,7 @@ impl LearnerHandle {
             .add_service(Guard::public(health_service, connections.clone()))
             .add_service(Guard::guarded(service, rules, connections.clone()));
         let router = server::with_reflection(router, SERVICE_NAME, FILE_DESCRIPTOR_SET, &connections)?;
+        let watching = tokio::spawn(watch_progress(self.shared.clone(), health.clone()));
         let shared = self.shared.clone();
         let stopped = shutdown.clone();
         let stopping = tokio::spawn(async move {
@@ -113,6 +129,7 @@ impl LearnerHandle {
         });
         let served = server::serve(router, incoming, self.security.tls.clone(), shutdown, server::GRACE).await;
         stopping.abort();
+        watching.abort();
         self.close();
         Ok(served?)
     }
@@ -152,6 +169,30 @@ impl LearnerHandle {
             return Err(status::unavailable("the learner is shutting down", Duration::from_secs(1)));
         }
         Ok(())
+    }
+}
+
+/// Says it, in the health and in the log, when no shard gets done although there is work and there are actors.
+async fn watch_progress(shared: Arc<Shared>, health: Health) {
+    let mut moving = None;
+    loop {
+        let stalled = shared.stalled();
+        if moving != Some(stalled.is_none()) {
+            health.set_part(PROGRESS, stalled.is_none()).await;
+            match &stalled {
+                Some((since, holders)) => {
+                    tracing::warn!(
+                        since_s = since.as_secs_f64(),
+                        holders,
+                        "no shard gets done: every actor that has one hangs"
+                    );
+                }
+                None if moving.is_some() => tracing::info!("shards get done again"),
+                None => {}
+            }
+            moving = Some(stalled.is_none());
+        }
+        tokio::time::sleep(PROGRESS_PERIOD).await;
     }
 }
 

@@ -3,7 +3,8 @@
 
 mod results;
 
-use crate::serve::ledger::{LeaseId, SessionId};
+use crate::run_events::describe;
+use crate::serve::ledger::{Asker, LeaseId, SessionId};
 use crate::serve::roster::ActorEntry;
 use crate::serve::shared::Shared;
 use magex_proto::parts::Assembler;
@@ -13,8 +14,9 @@ use magex_proto::{PROTOCOL_VERSION, v1};
 use magex_runtime::{status, trace};
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Instant;
-use tokio::sync::mpsc;
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
 use tokio_stream::{Stream, StreamExt as _};
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming};
@@ -24,6 +26,12 @@ pub(crate) type Outbound = mpsc::Sender<Result<v1::RolloutResponse, Status>>;
 
 /// Limit of the leases that an actor may hold, and of its credit for more.
 const MAX_LEASES: usize = 1024;
+
+/// An actor that gives leases back gets one at a time, and after the second in a row one in this time (or in the time of a lease,
+/// if that is less), until it delivers.
+const PROBE: Duration = Duration::from_secs(5);
+/// How often an idle actor is offered late shards that are kept for others with room.
+const LATE_PERIOD: Duration = Duration::from_millis(200);
 
 #[derive(Debug)]
 enum SessionEnd {
@@ -82,13 +90,25 @@ fn run_is_complete() -> v1::RolloutResponse {
     v1::RolloutResponse { message: Some(Response::Drain(drain)) }
 }
 
-/// Checks the hello and registers the session: its id, and the signal that another session of the process replaces it.
+/// Serves a connection whose hello has been read.
+#[cfg(test)]
+pub(crate) async fn serve_stream<S>(shared: Arc<Shared>, hello: v1::RolloutRequest, inbound: S, outbound: Outbound)
+where
+    S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
+{
+    match handshake(&shared, "simulated".to_owned(), hello, &outbound) {
+        Ok((registered, hello)) => Session::new(shared, registered, hello, outbound).serve(inbound).await,
+        Err(refusal) => drop(outbound.send(Err(refusal)).await),
+    }
+}
+
+/// Checks the hello and registers the session: its id, and the signals that end it.
 fn handshake(
     shared: &Shared,
     address: String,
     first: v1::RolloutRequest,
     outbound: &Outbound,
-) -> Result<((SessionId, CancellationToken), v1::Hello), Status> {
+) -> Result<((SessionId, Signals), v1::Hello), Status> {
     let Some(Request::Hello(hello)) = first.message else {
         return Err(status::invalid_argument("hello", "must be the first message"));
     };
@@ -106,7 +126,8 @@ fn handshake(
             hello.task_fingerprint
         )));
     }
-    let replaced = CancellationToken::new();
+    let (replaced, sent_away) = (CancellationToken::new(), watch::Sender::new(None));
+    let signals = Signals { replaced: replaced.clone(), sent_away: sent_away.subscribe() };
     let id = shared.roster.join(ActorEntry {
         status: v1::ActorStatus {
             actor_id: hello.actor_id.clone(),
@@ -116,14 +137,28 @@ fn handshake(
         },
         process_id: hello.process_id,
         last_seen: Instant::now(),
-        replaced: replaced.clone(),
+        replaced,
+        sent_away,
+        has_room: false,
+        hand_backs: 0,
         outbound: outbound.downgrade(),
     })?;
-    Ok(((id, replaced), hello))
+    Ok(((id, signals), hello))
+}
+
+/// How the rest of the service ends a session.
+#[derive(Clone)]
+struct Signals {
+    /// Another session of the process replaces this one.
+    replaced: CancellationToken,
+    /// The actor is sent away, for this reason.
+    sent_away: watch::Receiver<Option<String>>,
 }
 
 struct GrantedLease {
     since: Instant,
+    /// Whether the log says that it is late.
+    stalled: bool,
     /// From the grant to the verdict on its result.
     span: Span,
 }
@@ -131,9 +166,9 @@ struct GrantedLease {
 struct Session {
     shared: Arc<Shared>,
     id: SessionId,
-    actor_id: String,
+    actor_id: Arc<str>,
     process_id: u64,
-    replaced: CancellationToken,
+    signals: Signals,
     outbound: Outbound,
     credit: usize,
     assembler: Assembler,
@@ -145,25 +180,24 @@ struct Session {
     /// Shards that failed for good, in a row.
     failed: u32,
     damaged: u32,
+    /// Leases given back in a row.
+    hand_backs: u32,
+    /// When an actor that gives leases back gets the next one.
+    probe: Option<Instant>,
     last_seen: Instant,
 }
 
 impl Session {
-    fn new(
-        shared: Arc<Shared>,
-        (id, replaced): (SessionId, CancellationToken),
-        hello: v1::Hello,
-        outbound: Outbound,
-    ) -> Self {
+    fn new(shared: Arc<Shared>, (id, signals): (SessionId, Signals), hello: v1::Hello, outbound: Outbound) -> Self {
         tracing::info!(actor = hello.actor_id, threads = hello.threads, "actor joined");
         let assembler = Assembler::new(shared.limits.max_result_bytes());
         let last_seen = Instant::now();
         Self {
             shared,
             id,
-            actor_id: hello.actor_id,
+            actor_id: hello.actor_id.into(),
             process_id: hello.process_id,
-            replaced,
+            signals,
             outbound,
             credit: 0,
             assembler,
@@ -172,18 +206,23 @@ impl Session {
             rejected: 0,
             failed: 0,
             damaged: 0,
+            hand_backs: 0,
+            probe: None,
             last_seen,
         }
     }
 
-    async fn serve(mut self, inbound: Streaming<v1::RolloutRequest>) {
+    async fn serve<S>(mut self, inbound: S)
+    where
+        S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
+    {
         let end = self.run_loop(inbound).await;
         let lost = self.shared.remove_session(self.id);
         self.shared.metrics.session_ended(end.name());
         if !matches!(end, SessionEnd::Closing) {
             self.shared.roster.mark_missing(&self.actor_id);
         }
-        let (actor, rejected) = (&self.actor_id, self.rejected);
+        let (actor, rejected) = (&*self.actor_id, self.rejected);
         match end {
             SessionEnd::Left => tracing::info!(actor, lost, "actor left"),
             SessionEnd::Silent => {
@@ -212,25 +251,30 @@ impl Session {
     where
         S: Stream<Item = Result<v1::RolloutRequest, Status>> + Unpin,
     {
-        // Subscribed before the first grant, so that shards queued after it wake this loop.
-        let mut wakeups = self.shared.work.lease_wakeups();
+        let wakeups = self.shared.work.lease_wakeups();
         let (closing, complete) = (self.shared.control.closing.clone(), self.shared.control.complete.clone());
-        let (replaced, outbound) = (self.replaced.clone(), self.outbound.clone());
+        let (Signals { replaced, mut sent_away }, outbound) = (self.signals.clone(), self.outbound.clone());
         if let Err(end) = self.send(self.welcome()).await {
             return end;
         }
         loop {
-            wakeups.borrow_and_update();
+            // Made before the grant, so that shards queued after it wake this loop.
+            let offered = wakeups.notified();
             if let Err(end) = self.grant_leases().await {
                 return end;
             }
-            let deadline = tokio::time::Instant::from_std(self.last_seen + self.shared.lease_time());
+            self.complain_of_stalls();
+            let deadline = self.last_seen + self.shared.lease_time();
+            let next_grant = self.next_grant();
             // In this order: a message that has arrived counts before the deadline, however late it is read.
             tokio::select! {
                 biased;
                 () = closing.cancelled() => return SessionEnd::Closing,
                 () = complete.cancelled() => return SessionEnd::Closing,
                 () = replaced.cancelled() => return SessionEnd::Replaced,
+                reason = reason_of(&mut sent_away) => {
+                    return SessionEnd::Refused(status::invalid_argument("result", reason));
+                }
                 message = inbound.next() => {
                     self.mark_seen();
                     let handled = match message {
@@ -244,8 +288,9 @@ impl Session {
                     // The time spent on this message is not silence of the actor.
                     self.mark_seen();
                 }
-                changed = wakeups.changed(), if self.credit > 0 => if changed.is_err() { return SessionEnd::Closing },
+                () = offered, if self.credit > 0 => {}
                 () = outbound.closed() => return SessionEnd::Left,
+                () = until(next_grant) => {}
                 () = tokio::time::sleep_until(deadline) => return SessionEnd::Silent,
             }
         }
@@ -265,7 +310,52 @@ impl Session {
 
     fn mark_seen(&mut self) {
         self.last_seen = Instant::now();
-        self.shared.roster.update(self.id, |actor| actor.last_seen = self.last_seen);
+        let (has_room, hand_backs) = (self.credit > 0 && self.probe.is_none(), self.hand_backs);
+        self.shared.roster.update(self.id, |actor| {
+            (actor.last_seen, actor.has_room, actor.hand_backs) = (self.last_seen, has_room, hand_backs);
+        });
+    }
+
+    /// Names a lease once that is out for much longer than usual.
+    fn complain_of_stalls(&mut self) {
+        let Some(oldest) = self.shared.work.inspect(|ledger| {
+            let oldest = ledger.oldest_of(self.id)?;
+            (oldest.since.elapsed() >= ledger.stalled(oldest.shard.kind)).then_some(oldest)
+        }) else {
+            return;
+        };
+        let granted = self.granted.values_mut().filter(|granted| granted.since == oldest.since && !granted.stalled);
+        if let Some(granted) = granted.min_by_key(|granted| granted.since) {
+            granted.stalled = true;
+            tracing::warn!(
+                actor = &*self.actor_id,
+                shard = describe(&oldest.shard),
+                held_s = oldest.since.elapsed().as_secs_f64(),
+                "an actor holds a shard for much longer than usual; idle actors compute it meanwhile"
+            );
+        }
+    }
+
+    /// Leases that the actor may hold now.
+    fn limit(&self, now: Instant) -> usize {
+        match self.probe {
+            Some(probe) if now < probe => 0,
+            _ if self.hand_backs > 0 => 1,
+            _ => MAX_LEASES,
+        }
+    }
+
+    /// When it is worth asking the ledger again although nothing wakes this session.
+    fn next_grant(&self) -> Option<Instant> {
+        let now = Instant::now();
+        if self.credit == 0 || self.granted.len() >= self.limit(now).max(1) {
+            return None;
+        }
+        if let Some(probe) = self.probe.filter(|probe| now < *probe) {
+            return Some(probe);
+        }
+        let late = self.shared.work.inspect(|ledger| ledger.next_late(self.process_id));
+        late.map(|late| late.max(now + LATE_PERIOD / 10).min(now + LATE_PERIOD))
     }
 
     /// Sends a message. An actor that reads nothing for the time of a lease counts as silent.
@@ -279,15 +369,20 @@ impl Session {
     }
 
     async fn grant_leases(&mut self) -> Result<(), SessionEnd> {
-        while self.credit > 0 && self.granted.len() < MAX_LEASES {
-            let Some(lease) = self.shared.work.with_ledger(|ledger| ledger.lease(self.id)) else { break };
+        while self.credit > 0 && self.granted.len() < self.limit(Instant::now()) {
+            let asker = Asker { session: self.id, process: self.process_id, now: Instant::now() };
+            let others = || self.shared.roster.with_room(self.process_id);
+            let Some(lease) = self.shared.work.with_ledger(|ledger| ledger.lease(asker, others)) else { break };
             self.credit -= 1;
             let weights_sha256 = self.shared.board.sha256(lease.shard.version).unwrap_or_default();
             let span = self.shared.work.lease_span(&lease, &self.actor_id);
             let traceparent = trace::traceparent(&span);
-            self.granted.insert(lease.id, GrantedLease { since: Instant::now(), span });
+            self.granted.insert(lease.id, GrantedLease { since: asker.now, stalled: false, span });
             let shard = Some((&lease.shard).into());
             self.send(Response::Lease(v1::Lease { lease_id: lease.id.0, shard, weights_sha256, traceparent })).await?;
+            if self.credit == 0 {
+                self.shared.roster.update(self.id, |actor| actor.has_room = false);
+            }
         }
         Ok(())
     }
@@ -303,6 +398,23 @@ impl Session {
             Request::Failed(failed) => self.on_failed(&failed),
             Request::Part(part) => self.on_part(part).await,
         }
+    }
+}
+
+/// Why the actor is sent away, once it is.
+async fn reason_of(sent_away: &mut watch::Receiver<Option<String>>) -> String {
+    let reason = sent_away.wait_for(Option::is_some).await.ok().and_then(|reason| reason.clone());
+    match reason {
+        Some(reason) => reason,
+        // The roster has forgotten the session, which ends by itself.
+        None => std::future::pending().await,
+    }
+}
+
+async fn until(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time).await,
+        None => std::future::pending().await,
     }
 }
 

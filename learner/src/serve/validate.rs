@@ -1,5 +1,7 @@
 //! Validation of results before the learner trains on them.
 
+mod plausible;
+
 use bytes::Bytes;
 use magex_core::ids::RunId;
 use magex_core::metrics_table::METRICS;
@@ -9,8 +11,10 @@ use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, Shar
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
 
 /// The shapes of a run's results, and the limits of the service.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Limits {
+    /// The task, which says what its numbers can be.
+    pub task: TaskConfig,
     /// Sizes of a result's arrays; `episodes` is the limit per shard.
     pub shape: Shape,
     /// Static arrays of an episode.
@@ -23,7 +27,12 @@ pub struct Limits {
     pub max_actors: usize,
     /// Limit of open streams of weights and events.
     pub max_watchers: usize,
+    /// Share of the shards that are computed a second time.
+    pub recompute: f64,
 }
+
+/// Default of [`Limits::recompute`].
+pub const RECOMPUTE: f64 = 0.01;
 
 impl Limits {
     /// The limits of a task whose shards have at most `max_episodes` episodes.
@@ -31,7 +40,17 @@ impl Limits {
         let action_heads = task.action_heads();
         let shape = task.shape(max_episodes);
         let metrics = std::array::from_fn(|row| METRICS[row].applies(task));
-        Self { shape, statics: task.statics(), action_heads, metrics, max_actors: 256, max_watchers: 1024 }
+        let recompute = RECOMPUTE;
+        Self {
+            task: task.clone(),
+            shape,
+            statics: task.statics(),
+            action_heads,
+            metrics,
+            max_actors: 256,
+            max_watchers: 1024,
+            recompute,
+        }
     }
 
     /// Longest encoded result, bytes: its arrays, and a generous envelope.
@@ -48,8 +67,8 @@ impl Limits {
     }
 }
 
-/// Decodes a result and checks everything that does not depend on the plan: identity of the run, shapes, ranges, and that
-/// every number is finite.
+/// Decodes a result and checks everything that does not depend on the plan or the weights: identity of the run, shapes, that every
+/// number is finite and one that the task can give, and that the numbers agree with each other.
 ///
 /// # Errors
 /// Names the field and the index within it.
@@ -84,7 +103,8 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
         }
     }
     check_one_to_one(trajectory)?;
-    check_metrics("trajectory.metrics", limits, &trajectory.metrics)
+    check_metrics("trajectory.metrics", limits, &trajectory.metrics)?;
+    plausible::check(limits, trajectory)
 }
 
 /// Checks that in every stage no two agents have the same goal.

@@ -6,7 +6,7 @@ use magex_proto::v1::WatchWeightsResponse;
 pub use magex_proto::weights::Weights;
 use magex_runtime::net::heartbeat::Heartbeat;
 use magex_runtime::sync::lock;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
@@ -27,12 +27,24 @@ pub(crate) struct WeightsBoard {
     kept: watch::Sender<Snapshot>,
     /// Their hashes, and when they were published.
     published: Mutex<BTreeMap<WeightsVersion, (String, Instant)>>,
+    /// Hashes of versions that other weights have replaced, newest last.
+    withdrawn: Mutex<VecDeque<String>>,
 }
 
 impl WeightsBoard {
     /// Makes a version the latest and drops versions that are not older (the learner went back to an earlier checkpoint).
     pub(crate) fn publish(&self, weights: Arc<Weights>) {
         let mut published = lock(&self.published);
+        // Those after it belong to what is being undone.
+        let undone: Vec<WeightsVersion> = published.range(weights.version..).map(|(version, _)| *version).collect();
+        for (old, _) in undone.iter().filter_map(|version| published.remove(version)) {
+            if old != weights.sha256 {
+                let mut withdrawn = lock(&self.withdrawn);
+                withdrawn.push_back(old);
+                let surplus = withdrawn.len().saturating_sub(REMEMBERED);
+                withdrawn.drain(..surplus);
+            }
+        }
         published.insert(weights.version, (weights.sha256.clone(), Instant::now()));
         while published.len() > REMEMBERED {
             published.pop_first();
@@ -56,8 +68,17 @@ impl WeightsBoard {
         let _ = self.kept.subscribe().wait_for(|kept| !kept.is_empty()).await.map(drop);
     }
 
+    pub(crate) fn kept(&self, version: WeightsVersion) -> Option<Arc<Weights>> {
+        self.kept.borrow().iter().find(|weights| weights.version == version).cloned()
+    }
+
     pub(crate) fn is_kept(&self, version: WeightsVersion) -> bool {
-        self.kept.borrow().iter().any(|weights| weights.version == version)
+        self.kept(version).is_some()
+    }
+
+    /// Whether weights of this hash were replaced by others of the same version: the learner went back to a checkpoint.
+    pub(crate) fn is_withdrawn(&self, sha256: &str) -> bool {
+        lock(&self.withdrawn).iter().any(|other| other == sha256)
     }
 
     pub(crate) fn sha256(&self, version: WeightsVersion) -> Option<String> {

@@ -1,9 +1,11 @@
 //! The work of the open plan: the ledger, its timing and trace, and the two sides that wait for it: sessions for shards to
 //! lease, the training thread for the results.
 
+use crate::collector::{Conviction, Origin};
 use crate::report::bottleneck::CollectTiming;
 use crate::report::shard_timing::ShardTiming;
 use crate::run_events::{CollectError, StopReason};
+use crate::serve::ledger::checks::{Check, Sampling};
 use crate::serve::ledger::{Lease, Ledger};
 use crate::serve::lock_order::{OrderedMutex, Rank};
 use crate::serve::metrics::LearnerMetrics;
@@ -11,8 +13,8 @@ use magex_core::ids::Shard;
 use magex_core::trajectory::ShardResult;
 use magex_runtime::trace;
 use std::sync::{Arc, Condvar};
-use std::time::Instant;
-use tokio::sync::watch;
+use std::time::{Duration, Instant};
+use tokio::sync::Notify;
 use tracing::Span;
 
 #[derive(Debug)]
@@ -26,9 +28,26 @@ pub(crate) struct OpenWork {
 pub(crate) struct CollectedPlan {
     /// In the order of the plan.
     pub(crate) results: Vec<ShardResult>,
+    /// In the same order.
+    pub(crate) origins: Vec<Origin>,
     pub(crate) timing: CollectTiming,
     /// Ages of the training results, seconds.
     pub(crate) ages: Vec<f64>,
+}
+
+/// How often the training thread looks whether a check waits in vain.
+const CHECK_PERIOD: Duration = Duration::from_millis(250);
+
+/// What ends the wait of the training thread beside the plan. Called under the work lock, but for [`Self::decide`].
+pub(crate) trait Waiting {
+    /// Why the wait ends before the plan.
+    fn stop(&self) -> Option<StopReason>;
+
+    /// The processes of the connected actors.
+    fn connected(&self) -> Vec<u64>;
+
+    /// Computes a shard on this host and closes its check; an actor whose result differs is sent away.
+    fn decide(&mut self, check: &Check) -> Result<Option<Box<Conviction>>, CollectError>;
 }
 
 #[derive(Debug)]
@@ -36,18 +55,19 @@ pub(crate) struct Work {
     open: OrderedMutex<OpenWork>,
     /// The training thread waits here for the end of the plan.
     settled: Condvar,
-    /// Changes when there are shards to lease.
-    lease_wakeups: watch::Sender<u64>,
+    /// Wakes sessions, in the order in which they began to wait, when there are shards to lease.
+    lease_wakeups: Arc<Notify>,
     metrics: Arc<LearnerMetrics>,
 }
 
 impl Work {
-    pub(crate) fn new(first_lease: u64, metrics: Arc<LearnerMetrics>) -> Self {
-        let open = OpenWork { ledger: Ledger::new(first_lease), timing: ShardTiming::default(), trace: Span::none() };
+    pub(crate) fn new(first_lease: u64, lease: Duration, sampling: Sampling, metrics: Arc<LearnerMetrics>) -> Self {
+        let ledger = Ledger::new(first_lease, lease, sampling);
+        let open = OpenWork { ledger, timing: ShardTiming::default(), trace: Span::none() };
         Self {
             open: OrderedMutex::new(Rank::Work, open),
             settled: Condvar::new(),
-            lease_wakeups: watch::Sender::new(0),
+            lease_wakeups: Arc::default(),
             metrics,
         }
     }
@@ -56,19 +76,20 @@ impl Work {
     /// ended.
     pub(crate) fn update<T>(&self, change: impl FnOnce(&mut OpenWork) -> T) -> T {
         let mut open = self.open.lock();
-        let before = open.ledger.queued();
+        let before = open.ledger.offers();
         let value = change(&mut open);
         let ledger = &open.ledger;
-        let (queued, shards) = (ledger.queued(), ledger.counters());
-        let settled = ledger.is_complete() || ledger.given_up().is_some();
-        self.metrics.ledger(&shards, &ledger.episodes(), queued);
+        let (offers, shards) = (ledger.offers(), ledger.counters());
+        // A check that is open may need the training thread, which decides it.
+        let settled = ledger.is_complete() || ledger.given_up().is_some() || !ledger.checks.is_empty();
+        self.metrics.ledger(&shards, &ledger.episodes(), ledger.queued(), &ledger.checks.totals);
         open.timing.leases_outstanding(shards.outstanding, Instant::now());
         drop(open);
         if settled {
             self.settled.notify_all();
         }
-        if queued > before {
-            self.lease_wakeups.send_modify(|generation| *generation = generation.wrapping_add(1));
+        if offers > before {
+            self.lease_wakeups.notify_waiters();
         }
         value
     }
@@ -81,9 +102,9 @@ impl Work {
         read(&self.open.lock().ledger)
     }
 
-    /// Notified after every change that queued shards.
-    pub(crate) fn lease_wakeups(&self) -> watch::Receiver<u64> {
-        self.lease_wakeups.subscribe()
+    /// Notified after every change that offers something to lease.
+    pub(crate) fn lease_wakeups(&self) -> Arc<Notify> {
+        self.lease_wakeups.clone()
     }
 
     /// Opens a plan within the current span.
@@ -103,32 +124,65 @@ impl Work {
         tracing::info_span!(target: trace::TARGET, parent: &parent, "lease", iteration, index, actor)
     }
 
-    /// Blocks until the open plan is complete or given up, or `stop` returns a reason. `stop` runs under the work lock; what
-    /// it reads must change within [`Self::wake_after`].
-    pub(crate) fn wait(&self, stop: impl Fn() -> Option<StopReason>) -> Result<CollectedPlan, CollectError> {
+    /// Blocks until the open plan is complete or given up, an actor is convicted, or [`Waiting::stop`] returns a reason. What
+    /// `waiting` reads must change within [`Self::wake_after`].
+    pub(crate) fn wait(&self, waiting: &mut dyn Waiting) -> Result<CollectedPlan, CollectError> {
+        let end = self.wait_for(waiting, take);
         let mut open = self.open.lock();
-        let end = loop {
-            if let Some(results) = open.ledger.take() {
-                let (timing, ages) = open.timing.finish(Instant::now());
-                break Ok(CollectedPlan { results, timing, ages });
-            }
-            if let Some((shard, reason)) = open.ledger.given_up().cloned() {
-                break Err(CollectError::Shard { shard, reason });
-            }
-            if let Some(reason) = stop() {
-                break Err(CollectError::Stopped(reason));
-            }
-            if open.ledger.progress().1 == 0 {
-                return Err(CollectError::NoPlan);
-            }
-            open = open.wait(&self.settled);
-        };
         if end.is_err() {
             open.ledger.abandon();
         }
         // The span of the iteration ends, and is exported, when its last holder drops it.
         open.trace = Span::none();
         end
+    }
+
+    /// Blocks until every check has ended.
+    pub(crate) fn wait_for_checks(&self, waiting: &mut dyn Waiting) -> Result<(), CollectError> {
+        self.wait_for(waiting, |open| open.ledger.checks.is_empty().then_some(()))
+    }
+
+    fn wait_for<T>(
+        &self,
+        waiting: &mut dyn Waiting,
+        done: impl Fn(&mut OpenWork) -> Option<T>,
+    ) -> Result<T, CollectError> {
+        let mut open = self.open.lock();
+        loop {
+            match look(&mut open, waiting, &done) {
+                Look::Ended(end) => return end,
+                Look::Case(check) => {
+                    drop(open);
+                    if let Some(conviction) = waiting.decide(&check)? {
+                        return Err(CollectError::Convicted(conviction));
+                    }
+                    open = self.open.lock();
+                }
+                // Only checks have a time limit.
+                Look::Open if open.ledger.checks.is_empty() => open = open.wait(&self.settled),
+                Look::Open => open = open.wait_timeout(&self.settled, CHECK_PERIOD),
+            }
+        }
+    }
+
+    /// [`Self::wait`] without waiting: `None` while the plan is open.
+    #[cfg(test)]
+    pub(crate) fn poll(&self, waiting: &mut dyn Waiting) -> Option<Result<CollectedPlan, CollectError>> {
+        let mut open = self.open.lock();
+        let end = match look(&mut open, waiting, &take) {
+            Look::Open => return None,
+            Look::Ended(end) => end,
+            Look::Case(check) => {
+                drop(open);
+                let decided = waiting.decide(&check).transpose()?;
+                open = self.open.lock();
+                decided.and_then(|conviction| Err(CollectError::Convicted(conviction)))
+            }
+        };
+        if end.is_err() {
+            open.ledger.abandon();
+        }
+        Some(end)
     }
 
     /// Runs `change` under the work lock and wakes the training thread, which therefore cannot miss it between its check and
@@ -139,4 +193,42 @@ impl Work {
         drop(open);
         self.settled.notify_all();
     }
+}
+
+/// What the training thread finds when it looks.
+enum Look<T> {
+    Ended(Result<T, CollectError>),
+    /// A check that only this host can decide.
+    Case(Check),
+    Open,
+}
+
+fn look<T>(open: &mut OpenWork, waiting: &dyn Waiting, done: impl Fn(&mut OpenWork) -> Option<T>) -> Look<T> {
+    let ledger = &open.ledger;
+    // As long as shards are out, the actors have time for checks, too.
+    let idle = ledger.all_done() || ledger.progress().1 == 0;
+    let limit = |shard: &Shard| idle.then(|| ledger.late(shard.kind));
+    if let Some(check) = ledger.checks.case(&waiting.connected(), limit, tokio::time::Instant::now()) {
+        return Look::Case(check);
+    }
+    if let Some(value) = done(open) {
+        return Look::Ended(Ok(value));
+    }
+    if let Some((shard, reason)) = open.ledger.given_up().cloned() {
+        return Look::Ended(Err(CollectError::Shard { shard, reason }));
+    }
+    if let Some(reason) = waiting.stop() {
+        return Look::Ended(Err(CollectError::Stopped(reason)));
+    }
+    if open.ledger.progress().1 == 0 && open.ledger.checks.is_empty() {
+        return Look::Ended(Err(CollectError::NoPlan));
+    }
+    Look::Open
+}
+
+/// The results of a complete plan.
+fn take(open: &mut OpenWork) -> Option<CollectedPlan> {
+    let (results, origins) = open.ledger.take()?.into_iter().unzip();
+    let (timing, ages) = open.timing.finish(Instant::now());
+    Some(CollectedPlan { results, origins, timing, ages })
 }

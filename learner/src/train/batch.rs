@@ -120,6 +120,12 @@ impl Slice<'_> {
         self.batch.rows(&self.batch.actions, self.batch.shape.action_components, self.units, self.chunk)
     }
 
+    /// The episode of a row of the policy's outputs: one per agent, or one per team.
+    pub(crate) fn episode_of(&self, row: usize, team: bool) -> usize {
+        let chunk = if team { row } else { row / self.batch.shape.agents } % self.units.len();
+        self.units[chunk].0
+    }
+
     /// The rows of a [E, T, N] array.
     pub(crate) fn column(&self, values: &[f32]) -> CandleResult<Tensor> {
         column(self.batch.rows(values, 1, self.units, self.chunk))

@@ -8,6 +8,7 @@ mod imitation;
 #[cfg(test)]
 mod tests;
 
+use crate::train::algorithm::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use crate::train::batch::column;
 use crate::train::learned::{Learned, Network};
 use crate::train::mappo::clipped_surrogate;
@@ -89,7 +90,7 @@ impl CommanderPpo {
         trajectories: &[Trajectory],
         iteration: u32,
         rate_factor: f64,
-    ) -> Result<CommanderStats, CommanderError> {
+    ) -> Result<CommanderStats, UpdateError> {
         if !self.config.kind.learned() {
             return Ok(CommanderStats::default());
         }
@@ -98,7 +99,7 @@ impl CommanderPpo {
         let commander = self.commander(network)?;
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
-        for t in trajectories {
+        for (trajectory, t) in trajectories.iter().enumerate() {
             let (stages, points) = (self.stages.len(), (&*t.positions, t.statics.get(LANDMARKS)));
             for b in 0..t.shape.episodes {
                 if random_goals(self.seed, &t.shard, b as u32, self.config.random_assignment_fraction).is_some() {
@@ -127,7 +128,12 @@ impl CommanderPpo {
                     ratio_sum += greedy / exact;
                     let log_probs = commander.pick_log_probs(from_ref(&instance), from_ref(&picks))?;
                     let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
-                    error = error.max(f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64);
+                    let difference = f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64;
+                    if difference.is_nan() || difference > LOG_PROB_TOLERANCE {
+                        let (field, limit) = ("goal_log_probs", LOG_PROB_TOLERANCE);
+                        return Err(Suspect { trajectory, field, error: difference, limit }.into());
+                    }
+                    error = error.max(difference);
                     samples.push(Sample { instance, picks, advantage: advantage as f32 });
                 }
             }
@@ -229,7 +235,7 @@ impl CommanderPpo {
 }
 
 /// The k-th stage's assignment of an episode, `[N]`, out of the agents' chains of goals; `None` if it is not one-to-one.
-fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Vec<u32>> {
+pub(crate) fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Vec<u32>> {
     let (n, stages) = (t.shape.agents, t.shape.goals_per_agent);
     let mut goals = vec![u32::MAX; n];
     for (agent, chain) in t.goals[episode * n * stages..(episode + 1) * n * stages].chunks_exact(stages).enumerate() {

@@ -15,8 +15,10 @@
 //! | 10 | orthogonal initialisation, gain 0.01 in the last layer of the policy | `r_actor_critic.py` |
 //! | 11 | the horizon is a time limit: the value of the true last state is bootstrapped | ours (on-policy masks it) |
 //! | 12 | a minibatch is cut into a fixed number of slices whose gradients are added in their order | ours: the number of threads does not reach a number |
-//! | 13 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
+//! | 13 | log-probabilities that the first minibatch (with memories: every chunk) does not reproduce refuse the batch before anything is changed | ours |
+//! | 14 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
+use crate::train::algorithm::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use crate::train::batch::{Batch, Slice, column, sum_of_rows};
 use crate::train::gae::{Gae, ValueNorm};
 use crate::train::learned::{Learned, Network};
@@ -52,6 +54,8 @@ struct Evaluation {
     policy_memory: Vec<f32>,
     /// [T/L, N, H] memory of the value function entering each chunk.
     value_memory: Vec<f32>,
+    /// max |ln π − ln π_old| of one episode, of networks with a memory.
+    error: f64,
 }
 
 impl Mappo {
@@ -88,7 +92,16 @@ impl Mappo {
     }
 
     /// One update on an iteration's batch. `progress` in [0, 1] is the share of the budget spent.
-    pub fn update(&self, learned: &mut Learned, batch: &Batch, iteration: u32, progress: f64) -> Result<UpdateStats> {
+    ///
+    /// # Errors
+    /// [`Suspect`] names the episode whose log-probabilities are not those of the networks; then nothing has changed.
+    pub fn update(
+        &self,
+        learned: &mut Learned,
+        batch: &Batch,
+        iteration: u32,
+        progress: f64,
+    ) -> std::result::Result<UpdateStats, UpdateError> {
         let m = &self.config.mappo;
         let (steps, episodes, n) = (batch.shape.steps, batch.shape.episodes, batch.shape.agents);
         let (parts, value_norm) = (self.model.parts(), &mut learned.value_norm);
@@ -99,6 +112,9 @@ impl Mappo {
             .into_par_iter()
             .map(|episode| self.evaluate(networks, batch, episode))
             .collect::<Result<_>>()?;
+        for (episode, evaluation) in evaluations.iter().enumerate() {
+            check_log_probs(episode, evaluation.error)?;
+        }
 
         // 2. Advantages and returns in raw units, with the statistics that the values were made under.
         let (mean, deviation) = value_norm.moments();
@@ -132,6 +148,7 @@ impl Mappo {
                 let samples = (units.len() * self.chunk * n) as f32;
 
                 // 4. Value targets: the statistics take in this minibatch first.
+                let statistics = *value_norm;
                 value_norm.update(batch.rows(&returns, 1, units, self.chunk).into_iter());
                 let moments = value_norm.moments();
 
@@ -146,6 +163,14 @@ impl Mappo {
                     || slices.par_iter().map(value_loss).collect::<Result<Vec<_>>>(),
                 );
                 let (policy, value) = (policy?, value?);
+                if epoch == 0 && index == 0 {
+                    // The networks are still those that acted.
+                    for (slice, (_, sums)) in slices.iter().zip(&policy) {
+                        let (error, row) = sums.worst;
+                        check_log_probs(slice.episode_of(row, m.joint_ratio), error)
+                            .inspect_err(|_| *value_norm = statistics)?;
+                    }
+                }
 
                 // 6. If a loss is not finite, skip the update of all networks; `value_norm` has taken in the minibatch by then.
                 let mut sums = PolicySums::default();
@@ -177,6 +202,27 @@ impl Mappo {
         Ok(total.stats(parts))
     }
 
+    /// The log-probabilities [E, T, N] of a batch's actions under these networks: what its actors should have sent.
+    pub fn log_probs(&self, learned: &Learned, batch: &Batch) -> Result<Vec<f32>> {
+        let (steps, n) = (batch.shape.steps, batch.shape.agents);
+        let networks = &learned.networks[..self.model.parts().len()];
+        let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
+        let policy = self.model.policy(&mut networks.iter().map(constant).collect::<Result<Vec<_>>>()?)?;
+        let mut out = Vec::with_capacity(batch.shape.episodes * steps * n);
+        for episode in 0..batch.shape.episodes {
+            let mut hidden = vec![0.0; n * self.model.memory()];
+            for start in (0..steps).step_by(self.chunk) {
+                let slice = Slice { batch, units: &[(episode, start)], chunk: self.chunk, samples: 0.0 };
+                let features = slice.features();
+                let input = slice.input(&features, hidden.clone(), slice.noise());
+                let now = policy.evaluate(&input, &slice.actions())?;
+                out.extend(now.log_probs.to_vec1::<f32>()?);
+                hidden = last_state(now.states.as_ref(), hidden)?;
+            }
+        }
+        Ok(out)
+    }
+
     /// Values of all T+1 states of one episode, and the memories entering each chunk, by running both networks through
     /// the episode a chunk at a time.
     fn evaluate(&self, networks: &[Network], batch: &Batch, episode: usize) -> Result<Evaluation> {
@@ -185,7 +231,7 @@ impl Mappo {
         let constants = || networks.iter().map(constant).collect::<Result<Vec<_>>>();
         let (policy, value) = (self.model.policy(&mut constants()?)?, self.model.value(&mut constants()?)?);
         let values = Vec::with_capacity((steps + 1) * n);
-        let mut out = Evaluation { values, policy_memory: Vec::new(), value_memory: Vec::new() };
+        let mut out = Evaluation { values, policy_memory: Vec::new(), value_memory: Vec::new(), error: 0.0 };
         let mut value_hidden = vec![0.0; n * memory];
         let mut policy_hidden = value_hidden.clone();
         // Networks without memory have no chunks to respect: a chunk's length only bounds the working memory.
@@ -202,7 +248,10 @@ impl Mappo {
                 out.value_memory.extend_from_slice(&value_hidden);
                 value_hidden = last_state(output.states.as_ref(), value_hidden)?;
                 let input = slice.input(&features, policy_hidden.clone(), slice.noise());
-                policy_hidden = last_state(policy.evaluate(&input, &slice.actions())?.states.as_ref(), policy_hidden)?;
+                let now = policy.evaluate(&input, &slice.actions())?;
+                let differences = (now.log_probs - slice.column(&batch.log_probs)?)?.to_vec1::<f32>()?;
+                out.error = differences.into_iter().fold(out.error, |worst, x| worse(worst, x));
+                policy_hidden = last_state(now.states.as_ref(), policy_hidden)?;
             }
             start += count;
         }
@@ -319,12 +368,20 @@ struct PolicySums {
     kl: f64,
     /// max |ρ − 1|.
     ratio_error: f64,
+    /// max |ln ρ|, and its row.
+    worst: (f64, usize),
 }
 
 impl PolicySums {
     fn of(surrogate: &Tensor, entropies: &Tensor, ratio: &Tensor, log_ratio: &Tensor, clip: f32) -> Result<Self> {
         let mut sums = Self { loss: -sum(surrogate)?, entropy: sum(entropies)?, ..Self::default() };
-        for (ratio, log_ratio) in ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?) {
+        for (row, (ratio, log_ratio)) in
+            ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?).enumerate()
+        {
+            let error = worse(sums.worst.0, log_ratio);
+            if error > sums.worst.0 {
+                sums.worst = (error, row);
+            }
             sums.clipped += f64::from(u8::from((ratio - 1.0).abs() > clip));
             sums.kl += f64::from(ratio - 1.0 - log_ratio);
             sums.ratio_error = sums.ratio_error.max(f64::from((ratio - 1.0).abs()));
@@ -334,8 +391,9 @@ impl PolicySums {
 
     /// Of rows that stand for several samples each.
     fn times(self, weight: f64) -> Self {
-        let Self { loss, entropy, clipped, kl, ratio_error } = self;
-        Self { loss: loss * weight, entropy: entropy * weight, clipped: clipped * weight, kl: kl * weight, ratio_error }
+        let Self { loss, entropy, clipped, kl, ratio_error, worst } = self;
+        let [loss, entropy, clipped, kl] = [loss, entropy, clipped, kl].map(|sum| sum * weight);
+        Self { loss, entropy, clipped, kl, ratio_error, worst }
     }
 
     fn add(&mut self, other: &Self) {
@@ -345,6 +403,19 @@ impl PolicySums {
         self.kl += other.kl;
         self.ratio_error = self.ratio_error.max(other.ratio_error);
     }
+}
+
+/// The larger of an error and |x|; infinite if x is no number.
+fn worse(error: f64, x: f32) -> f64 {
+    if x.is_nan() { f64::INFINITY } else { error.max(f64::from(x.abs())) }
+}
+
+/// Refuses log-probabilities that the networks do not give.
+fn check_log_probs(episode: usize, error: f64) -> std::result::Result<(), Suspect> {
+    if error <= LOG_PROB_TOLERANCE {
+        return Ok(());
+    }
+    Err(Suspect { trajectory: episode, field: "log_probs", error, limit: LOG_PROB_TOLERANCE })
 }
 
 /// Sums over the minibatches of an update.

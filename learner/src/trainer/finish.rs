@@ -1,10 +1,11 @@
 //! The end of a run: the evaluation that closes it, and the files that it leaves.
 
+use super::trust::Collected;
 use super::{EVAL_SET_FINAL, SUMMARY_FILE, TrainError, TrainOutcome, Trainer, plan, split};
 use crate::collector::Collector;
 use crate::report::means::{ClosingMeans, summarise};
 use crate::report::records::Summary;
-use crate::run_events::{CollectError, RunEvent};
+use crate::run_events::RunEvent;
 use crate::train::learned::Learned;
 use magex_core::ids::{Mode, Shard};
 use magex_core::metrics_table::SUCCESS_RATE;
@@ -15,22 +16,30 @@ use magex_viewer::page::Phase;
 use std::path::Path;
 
 impl Trainer {
-    /// The last checkpoint, the evaluation that closes the run, and the files that the run leaves.
+    /// The last checkpoint, the evaluation that closes the run, and the files that the run leaves. `None`: results were wrong,
+    /// and the run is not at its end.
     pub(super) fn finish(
         &mut self,
         collector: &mut dyn Collector,
         target_reached: bool,
-    ) -> Result<TrainOutcome, TrainError> {
+    ) -> Result<Option<TrainOutcome>, TrainError> {
         let wall_s = self.wall_s();
         self.save();
         let (iteration, episodes) = (self.progress.iteration, self.config.run.final_episodes);
         let mut plan: Vec<Shard> = plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Greedy, true).collect();
         plan.extend(plan::evaluation(iteration, EVAL_SET_FINAL, episodes, Mode::Sampled, false));
         self.notify(|observer| observer.phase(Phase::Evaluating));
-        let results = match collector.collect(plan) {
-            Err(CollectError::Stopped(reason)) => return Ok(TrainOutcome::Stopped(reason)),
-            other => other?,
+        let results = match self.collect(collector, plan)? {
+            Collected::Results(results) => results,
+            Collected::Stopped(reason) => return Ok(Some(TrainOutcome::Stopped(reason))),
+            Collected::Again => return Ok(None),
         };
+        // What is wrong in the last iterations must show before the run says that it is done.
+        match self.confirm(collector, &[])? {
+            Collected::Results(_) => {}
+            Collected::Stopped(reason) => return Ok(Some(TrainOutcome::Stopped(reason))),
+            Collected::Again => return Ok(None),
+        }
         let (_, outcomes) = split(results);
         self.notify(|observer| observer.evaluated(&outcomes));
         let means_of = |mode: Mode| {
@@ -60,10 +69,10 @@ impl Trainer {
         let files: [(&str, &[u8]); 3] =
             [("weights.safetensors", &weights), ("recordings.json", &recordings), (SUMMARY_FILE, line.as_bytes())];
         if let Some(reason) = self.write_last_files(collector, &files)? {
-            return Ok(TrainOutcome::Stopped(reason));
+            return Ok(Some(TrainOutcome::Stopped(reason)));
         }
         self.event(&RunEvent::Finished(FinishedEvent { summary_json: line }));
-        Ok(TrainOutcome::Finished(Box::new(summary)))
+        Ok(Some(TrainOutcome::Finished(Box::new(summary))))
     }
 }
 

@@ -4,6 +4,7 @@ use crate::checkpoint::CheckpointError;
 use crate::report::observer::FileError;
 use crate::report::records::Summary;
 use crate::run_events::{CollectError, StopReason};
+use crate::train::algorithm::UpdateError;
 use magex_core::config::ConfigError;
 use magex_nets::commander::CommanderError;
 use magex_nets::params::ParamError;
@@ -18,10 +19,24 @@ pub enum TrainError {
     /// A checkpoint could not be read or written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The networks could not be built or updated.
+    /// The networks could not be built.
     #[error(transparent)]
     Weights(#[from] ParamError),
-    /// The commander could not be built or updated.
+    /// The networks could not be updated.
+    #[error(transparent)]
+    Update(#[from] UpdateError),
+    /// Wrong results were trained on, and no checkpoint from before them is left.
+    #[error(
+        "{what}, and its results have been trained on since iteration {iteration}; no checkpoint from before that is left, so \
+         nothing in this folder can be relied on from there on: start the run anew with another --out"
+    )]
+    Tainted {
+        /// Which actor computed what.
+        what: String,
+        /// The first iteration that may have trained on wrong results.
+        iteration: u32,
+    },
+    /// The commander could not be built.
     #[error(transparent)]
     Commander(#[from] CommanderError),
     /// A file of the run folder could not be read or written.

@@ -91,8 +91,8 @@ impl Trainer {
         self.observers.iter_mut().try_for_each(|observer| observer.flush())?;
         self.observers.iter_mut().try_for_each(|observer| observer.sync())?;
         let progress = Progress { wall_s: self.wall_s(), ..self.progress.clone() };
-        let (folder, keep) = (self.place.folder(), self.config.run.keep_checkpoints);
-        Ok(checkpoint::write_on(&*self.disk, folder, &progress, &self.learned, keep)?)
+        let (folder, keep) = (self.place.folder(), (self.config.run.keep_checkpoints, self.unconfirmed_since));
+        Ok(checkpoint::write_keeping(&*self.disk, folder, &progress, &self.learned, keep)?)
     }
 
     /// A checkpoint in a folder that was removed would make one without the other files of a run.

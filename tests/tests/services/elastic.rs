@@ -19,7 +19,8 @@ async fn two_actors_share_the_work_and_the_batch_is_in_order() {
         assert_eq!(learner.iterate(iteration, 16).await.unwrap(), expected(&plan(iteration, 16)));
     }
     let ledger = learner.ledger();
-    assert_eq!((ledger.leased, ledger.trained, ledger.outstanding), (48, 48, 0));
+    // Beside them, the first results of each were computed a second time by the other.
+    assert_eq!((ledger.leased - ledger.duplicate, ledger.trained, ledger.outstanding), (48, 48, 0));
     until(|| learner.handle.status().actors.iter().all(|actor| actor.shards_done > 0)).await;
     for actor in actors {
         assert!(actor.stop().await.accepted > 0);

@@ -4,10 +4,11 @@ use bytes::Bytes;
 use magex_actor::goal_client::{GoalRequest, GrpcGoals};
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, WorkError, Worker};
+use magex_assign::{cost_of_points, exact_points};
 use magex_commander::scheduler::{GoalReply, LoadScheduler, Scheduler, SchedulerError, TeamReply};
 use magex_commander::service::ServiceConfig;
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
-use magex_core::metrics_table::METRICS;
+use magex_core::metrics_table::{COST_RATIO, METRICS, REWARD};
 use magex_core::rng::{Key, Purpose};
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
@@ -73,23 +74,36 @@ pub(crate) fn result_of(task: &TaskConfig, shard: &Shard, weights: &[u8]) -> Sha
     let tag = weights.iter().map(|&byte| u32::from(byte)).sum();
     let mut stream = Key::new(SEED, Purpose::Action, &[shard.iteration.0, shard.index, tag]).stream();
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| stream.uniform32()).collect() };
-    // A value that every metric may have.
-    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
+    let (positions, velocities) = (numbers((t + 1) * b * n * 2), numbers((t + 1) * b * n * 2));
+    let (landmarks, rewards) = (numbers(b * n * 2), numbers(t * b * n));
+    let in_order: Vec<u32> = (0..n as u32).collect();
+    let sides = |e: usize| (&positions[e * n * 2..(e + 1) * n * 2], &landmarks[e * n * 2..(e + 1) * n * 2]);
+    let cost = |e| cost_of_points(sides(e).0, sides(e).1, 2, &in_order) as f32;
+    let exact = |e| exact_points(sides(e).0, sides(e).1, 2).unwrap().1 as f32;
+    let (costs, exact_costs): (Vec<f32>, Vec<f32>) = (0..b).map(|e| (cost(e), exact(e))).unzip();
+    let metrics = |e: usize| {
+        // A value that every metric may have.
+        let mut metrics = EpisodeMetrics([1.0; METRICS.len()]);
+        let row = |step: usize| &rewards[(step * b + e) * n..(step * b + e + 1) * n];
+        metrics[REWARD] = (0..t).flat_map(row).sum::<f32>() / (t * n) as f32;
+        metrics[COST_RATIO] = costs[e] / exact_costs[e];
+        metrics
+    };
     ShardResult::Train(Trajectory {
         shard: *shard,
         shape,
-        positions: numbers((t + 1) * b * n * 2),
-        velocities: numbers((t + 1) * b * n * 2),
+        metrics: (0..b).map(metrics).collect(),
+        positions,
+        velocities,
         agent_state: vec![],
-        statics: Statics::landmarks(n, 2, numbers(b * n * 2)),
+        statics: Statics::landmarks(n, 2, landmarks),
         goals: (0..b * n).map(|i| (i % n) as u32).collect(),
         actions: vec![1; t * b * n],
         log_probs: vec![-1.0; t * b * n],
-        rewards: numbers(t * b * n),
+        rewards,
         goal_log_probs: vec![-1.0; b],
-        costs: vec![2.0; b],
-        exact_costs: vec![1.0; b],
-        metrics: vec![metrics; b],
+        costs,
+        exact_costs,
     })
 }
 

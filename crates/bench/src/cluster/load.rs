@@ -1,8 +1,9 @@
 //! Made-up weights, plans and results.
 
 use bytes::Bytes;
+use magex_assign::{cost_of_points, exact_points};
 use magex_core::ids::{Iteration, Mode, RunId, Shard, ShardKind, WeightsVersion};
-use magex_core::metrics_table::METRICS;
+use magex_core::metrics_table::{COST_RATIO, METRICS, REWARD};
 use magex_core::rng::{Key, Purpose};
 use magex_core::statics::Statics;
 use magex_core::task::{Spawn, TaskConfig};
@@ -58,29 +59,44 @@ fn shard(index: u32, episodes: u32) -> Shard {
     }
 }
 
-/// Numbers that could be those of an episode.
+/// Numbers that could be those of an episode: the learner refuses others.
 fn trajectory(task: &TaskConfig, shard: &Shard) -> Trajectory {
     let shape = task.shape(shard.episodes as usize);
     let (t, b, n) = (shape.steps, shape.episodes, shape.agents);
     let mut stream = Key::new(0, Purpose::Action, &[shard.index]).stream();
     let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| stream.uniform32()).collect() };
-    // A value that every metric may have.
-    let metrics = EpisodeMetrics([1.0; METRICS.len()]);
+    let positions = numbers((t + 1) * b * shape.bodies * shape.dims);
+    let landmarks = numbers(b * shape.landmarks * shape.dims);
+    let rewards = numbers(t * b * n);
+    let in_order: Vec<u32> = (0..n as u32).collect();
+    let width = n * shape.dims;
+    let sides = |e: usize| (&positions[e * width..(e + 1) * width], &landmarks[e * width..(e + 1) * width]);
+    let cost = |e| cost_of_points(sides(e).0, sides(e).1, shape.dims, &in_order) as f32;
+    let exact = |e| exact_points(sides(e).0, sides(e).1, shape.dims).map_or(0.0, |(_, cost)| cost as f32);
+    let (costs, exact_costs): (Vec<f32>, Vec<f32>) = (0..b).map(|e| (cost(e), exact(e))).unzip();
+    let metrics = |e: usize| {
+        // A value that every metric may have.
+        let mut metrics = EpisodeMetrics([1.0; METRICS.len()]);
+        let row = |step: usize| &rewards[(step * b + e) * n..(step * b + e + 1) * n];
+        metrics[REWARD] = ((0..t).flat_map(row).map(|&x| f64::from(x)).sum::<f64>() / (t * n) as f64) as f32;
+        metrics[COST_RATIO] = costs[e] / exact_costs[e].max(1e-9);
+        metrics
+    };
     Trajectory {
         shard: *shard,
         shape,
-        positions: numbers((t + 1) * b * shape.bodies * shape.dims),
+        metrics: (0..b).map(metrics).collect(),
         velocities: numbers((t + 1) * b * shape.bodies * shape.dims),
         agent_state: numbers((t + 1) * b * n * shape.agent_state),
-        statics: Statics::landmarks(shape.landmarks, shape.dims, numbers(b * shape.landmarks * shape.dims)),
+        statics: Statics::landmarks(shape.landmarks, shape.dims, landmarks),
         goals: (0..b).flat_map(|_| 0..n as u32).collect(),
         actions: vec![1; t * b * n * shape.action_components],
         log_probs: numbers(t * b * n).iter().map(|x| -x).collect(),
-        rewards: numbers(t * b * n),
         goal_log_probs: vec![-1.0; b * shape.goals_per_agent],
-        costs: vec![2.0; b * shape.goals_per_agent],
-        exact_costs: vec![1.0; b * shape.goals_per_agent],
-        metrics: vec![metrics; b],
+        costs,
+        exact_costs,
+        positions,
+        rewards,
     }
 }
 

@@ -1,6 +1,6 @@
 //! What a task has to say about itself: one value per task, from which everything else is derived.
 
-use super::{ActionCode, Observation, Stage, TaskConfig, TaskName, TaskSettings};
+use super::{ActionCode, Bounds, Observation, Stage, TaskConfig, TaskName, TaskSettings};
 use crate::error::FieldError;
 use crate::statics::StaticSpec;
 
@@ -37,6 +37,10 @@ pub struct Definition {
     pub(super) default_settings: fn(f32) -> TaskSettings,
     /// The same with the keys of `[task.<section>]`.
     pub(super) read_settings: fn(f32, toml::Table) -> Result<TaskSettings, FieldError>,
+    /// What the states of an episode can be.
+    pub(super) bounds: fn(&TaskConfig) -> Bounds,
+    /// Smallest and largest reward of an agent in a step, for a largest distance between any two points.
+    pub(super) reward_range: fn(&TaskConfig, f32) -> [f32; 2],
     /// Checks the ranges of what the task does not share with others.
     pub(super) validate: fn(&TaskConfig) -> Result<(), FieldError>,
 }

@@ -1,7 +1,8 @@
 //! The drone task as data.
 
+use super::bounds;
 use super::definition::{Definition, fits, wrong_task};
-use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
+use super::{ActionCode, Bounds, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
 use crate::error::FieldError;
 use crate::section::section;
 use crate::toml_table;
@@ -82,6 +83,20 @@ pub(super) const DEFINITION: Definition = Definition {
     layout_scale: |_| 1.0,
     default_settings: |_| TaskSettings::Drones(DroneConfig::default()),
     read_settings: |_, section| toml_table::read("task.drones", section, DroneConfig::bounds).map(TaskSettings::Drones),
+    // Contacts and the unlimited wash can throw a drone, but not at a hundred times the speed of sound.
+    bounds: |task| {
+        let velocity = 34_000.0;
+        let seconds = task.horizon as f32 / DroneConfig::COMMANDS_HZ as f32;
+        Bounds { position: bounds::start(task) + velocity * seconds, velocity, agent_state: 10.0 }
+    },
+    reward_range: |task, extent| match task.drones() {
+        // 1 − cos(tilt angle) / cos 45° is at most 1 + √2.
+        Ok(d) => {
+            let way = d.progress * extent;
+            [-(way + d.crash + d.proximity + d.tilt * (1.0 + std::f32::consts::SQRT_2)), way + d.bonus]
+        }
+        Err(_) => [f32::MIN, f32::MAX],
+    },
     validate,
 };
 

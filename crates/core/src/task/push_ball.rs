@@ -1,5 +1,6 @@
 //! Push Ball as data.
 
+use super::bounds;
 use super::definition::{Definition, fits, up_to_tens, wrong_task};
 use super::{ActionCode, Frame, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
 use crate::error::FieldError;
@@ -72,6 +73,15 @@ pub(super) const DEFINITION: Definition = Definition {
     default_settings: |_| TaskSettings::PushBall(PushBallConfig::default()),
     read_settings: |_, section| {
         toml_table::read("task.push_ball", section, PushBallConfig::bounds).map(TaskSettings::PushBall)
+    },
+    bounds: |task| bounds::of_particles(task, 2 * task.agents),
+    reward_range: |task, extent| match task.push_ball() {
+        Ok(p) => {
+            // |Φ' − Φ| where 0 ≥ Φ ≥ −(d_ab + turn_length · π + 2 · d_bl).
+            let gained = p.progress * (3.0 * extent + p.turn_length * std::f32::consts::PI);
+            [-(gained + 2.0 * p.distance * extent), gained + p.bonus]
+        }
+        Err(_) => [f32::MIN, f32::MAX],
     },
     validate,
 };

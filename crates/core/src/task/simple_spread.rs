@@ -1,5 +1,6 @@
 //! Simple Spread (paper, section 5.1.1) as data.
 
+use super::bounds;
 use super::definition::{Definition, fits, up_to_tens, wrong_task};
 use super::{ActionCode, Group, Observation, Spawn, Stage, TaskConfig, TaskName, TaskSettings};
 use crate::error::FieldError;
@@ -59,6 +60,11 @@ pub(super) const DEFINITION: Definition = Definition {
             return Err(FieldError::new("task.reward.distance_unit", super::NOT_ZERO));
         }
         Ok(TaskSettings::SimpleSpread(reward))
+    },
+    bounds: |task| bounds::of_particles(task, task.agents),
+    reward_range: |task, extent| match task.reward() {
+        Ok(r) => [-(r.distance / r.distance_unit * extent + r.collision * task.agents as f32), r.bonus],
+        Err(_) => [f32::MIN, f32::MAX],
     },
     validate,
 };

@@ -1,6 +1,7 @@
 //! `magex learner`, `magex actor`, `magex commander`: one service each, from the same executable.
 
 use crate::folder;
+use crate::local;
 use crate::parent_watch::ParentWatch;
 use magex_actor::cli::ActorArgs;
 use magex_commander::cli::CommanderArgs;
@@ -98,7 +99,7 @@ pub(crate) struct CommanderRole {
 
 pub(crate) fn learner(role: &LearnerRole) -> anyhow::Result<u8> {
     role.parent.start()?;
-    Ok(magex_learner::cli::run(role.args.clone())?)
+    Ok(magex_learner::cli::run(role.args.clone(), local::judge)?)
 }
 
 pub(crate) fn actor(role: &ActorRole) -> anyhow::Result<u8> {

@@ -28,8 +28,27 @@ fn result(shard: Shard) -> ShardResult {
     ShardResult::Eval(EvalOutcome { shard, metrics: Vec::new(), recording: None })
 }
 
+const LEASE: Duration = Duration::from_secs(10);
+
+/// A ledger that has nothing computed twice.
+fn ledger(first_lease: u64) -> Ledger {
+    Ledger::new(first_lease, LEASE, Sampling { key: 1, share: 0.0 })
+}
+
+/// A result of a process that has the number of its session; all processes give the same.
+fn origin(session: SessionId) -> (Origin, Instant) {
+    (Origin { actor: "a".into(), process: session.0, digest: "same".into() }, Instant::now())
+}
+
+impl Ledger {
+    /// Of the only actor with room.
+    fn next(&mut self, session: SessionId) -> Option<Lease> {
+        self.lease(Asker { session, process: session.0, now: Instant::now() }, Vec::new)
+    }
+}
+
 fn opened(shards: u32) -> Ledger {
-    let mut ledger = Ledger::new(100);
+    let mut ledger = ledger(100);
     ledger.open(plan(0, shards)).unwrap();
     ledger
 }
@@ -37,13 +56,13 @@ fn opened(shards: u32) -> Ledger {
 #[test]
 fn results_come_out_in_the_order_of_the_plan() {
     let mut ledger = opened(3);
-    let leases: Vec<Lease> = (0..3).map(|_| ledger.lease(A).unwrap()).collect();
-    assert!(ledger.lease(B).is_none());
+    let leases: Vec<Lease> = (0..3).map(|_| ledger.next(A).unwrap()).collect();
+    assert!(ledger.next(B).is_none());
     for lease in [leases[2], leases[0], leases[1]] {
         assert!(ledger.take().is_none());
-        assert_eq!(ledger.complete(A, lease.id, result(lease.shard)), Ok(Verdict::Accepted));
+        assert_eq!(ledger.complete(A, lease.id, result(lease.shard), origin(A)), Ok(Verdict::Accepted));
     }
-    let order: Vec<u32> = ledger.take().unwrap().iter().map(|result| result.shard().index).collect();
+    let order: Vec<u32> = ledger.take().unwrap().iter().map(|(result, _)| result.shard().index).collect();
     assert_eq!(order, [0, 1, 2]);
     assert!(ledger.take().is_none() && ledger.progress() == (0, 0));
 }
@@ -51,10 +70,10 @@ fn results_come_out_in_the_order_of_the_plan() {
 #[test]
 fn the_leases_of_a_lost_actor_come_next_and_in_order() {
     let mut ledger = opened(4);
-    ledger.lease(A).unwrap();
-    ledger.lease(A).unwrap();
+    ledger.next(A).unwrap();
+    ledger.next(A).unwrap();
     assert_eq!(ledger.drop_actor(A), 2);
-    let order: Vec<u32> = std::iter::from_fn(|| ledger.lease(B)).map(|lease| lease.shard.index).collect();
+    let order: Vec<u32> = std::iter::from_fn(|| ledger.next(B)).map(|lease| lease.shard.index).collect();
     assert_eq!(order, [0, 1, 2, 3]);
     assert_eq!(ledger.counters(), Counters { leased: 6, expired: 2, outstanding: 4, ..Counters::default() });
     // Of 1, 2, 3 and 1 episodes.
@@ -64,11 +83,11 @@ fn the_leases_of_a_lost_actor_come_next_and_in_order() {
 #[test]
 fn the_late_result_of_a_lost_lease_counts_once() {
     let mut ledger = opened(1);
-    let lost = ledger.lease(A).unwrap();
+    let lost = ledger.next(A).unwrap();
     ledger.drop_actor(A);
-    let again = ledger.lease(B).unwrap();
-    assert_eq!(ledger.complete(A, lost.id, result(lost.shard)), Ok(Verdict::Accepted));
-    assert_eq!(ledger.complete(B, again.id, result(again.shard)), Ok(Verdict::Duplicate));
+    let again = ledger.next(B).unwrap();
+    assert_eq!(ledger.complete(A, lost.id, result(lost.shard), origin(A)), Ok(Verdict::Accepted));
+    assert_eq!(ledger.complete(B, again.id, result(again.shard), origin(B)), Ok(Verdict::Duplicate));
     assert_eq!(ledger.episodes().residual, 0);
     let counters = ledger.counters();
     assert_eq!((counters.leased, counters.trained, counters.duplicate, counters.expired), (3, 1, 1, 1));
@@ -78,15 +97,15 @@ fn the_late_result_of_a_lost_lease_counts_once() {
 #[test]
 fn a_result_of_another_shard_than_the_leased_one_is_rejected_and_redone() {
     let mut ledger = opened(2);
-    let lease = ledger.lease(A).unwrap();
-    assert!(ledger.complete(A, lease.id, result(shard(0, 1))).is_err());
-    assert_eq!(ledger.lease(A).unwrap().shard, lease.shard);
+    let lease = ledger.next(A).unwrap();
+    assert!(ledger.complete(A, lease.id, result(shard(0, 1)), origin(A)).is_err());
+    assert_eq!(ledger.next(A).unwrap().shard, lease.shard);
     assert_eq!(ledger.counters().residual, 0);
 }
 
 /// One attempt that fails for good, by an actor whose process has the number of its session.
 fn fail(ledger: &mut Ledger, session: u64, actor: &str, connected: &[u64]) {
-    let lease = ledger.lease(SessionId(session)).unwrap();
+    let lease = ledger.next(SessionId(session)).unwrap();
     let failure = ShardFailure { actor, process: session, reason: "no such task", connected };
     assert!(ledger.fail(SessionId(session), lease.id, &failure));
 }
@@ -95,7 +114,7 @@ fn fail(ledger: &mut Ledger, session: u64, actor: &str, connected: &[u64]) {
 fn a_shard_that_may_succeed_is_not_given_up() {
     let mut ledger = opened(1);
     for _ in 0..10 {
-        let lease = ledger.lease(A).unwrap();
+        let lease = ledger.next(A).unwrap();
         ledger.give_back(A, lease.id);
     }
     assert_eq!(ledger.given_up(), None);
@@ -147,7 +166,7 @@ fn a_shard_is_given_up_after_every_connected_actor_failed_at_it() {
 #[test]
 fn a_failure_of_a_lease_that_is_held_no_more_says_nothing() {
     let mut ledger = opened(1);
-    let lease = ledger.lease(A).unwrap();
+    let lease = ledger.next(A).unwrap();
     ledger.drop_actor(A);
     let failure = ShardFailure { actor: "a", process: 1, reason: "x", connected: &[1] };
     for _ in 0..MAX_FAILURES {
@@ -158,7 +177,7 @@ fn a_failure_of_a_lease_that_is_held_no_more_says_nothing() {
 
 #[test]
 fn plans_that_make_no_sense_are_refused() {
-    let mut ledger = Ledger::new(0);
+    let mut ledger = ledger(0);
     assert!(matches!(ledger.open(Vec::new()), Err(CollectError::EmptyPlan)));
     assert!(matches!(ledger.open(vec![shard(1, 2), shard(1, 2)]), Err(CollectError::Repeated(2, 1))));
     ledger.open(plan(0, 2)).unwrap();
@@ -194,7 +213,7 @@ proptest! {
     /// Whatever happens: no lease is lost or counted twice, no shard is trained twice, and one good actor finishes the plan.
     #[test]
     fn every_lease_ends_once_and_every_plan_can_be_finished(steps in steps(), shards in 1u32..6) {
-        let mut ledger = Ledger::new(0);
+        let mut ledger = ledger(0);
         let mut iteration = 0;
         let mut seen: Vec<Lease> = Vec::new();
         let mut handed_out = 0;
@@ -202,9 +221,9 @@ proptest! {
         for step in steps {
             let pick = |lease: usize| seen.get(lease % seen.len().max(1)).copied();
             match step {
-                Step::Lease(actor) => seen.extend(ledger.lease(SessionId(actor))),
+                Step::Lease(actor) => seen.extend(ledger.next(SessionId(actor))),
                 Step::Complete { actor, lease } => if let Some(lease) = pick(lease) {
-                    let _ = ledger.complete(SessionId(actor), lease.id, result(lease.shard));
+                    let _ = ledger.complete(SessionId(actor), lease.id, result(lease.shard), origin(SessionId(actor)));
                 },
                 Step::Reject { actor, lease } => if let Some(lease) = pick(lease) {
                     ledger.reject(SessionId(actor), lease.id);
@@ -233,7 +252,7 @@ proptest! {
             prop_assert!(done <= total);
             if let Some(results) = ledger.take() {
                 handed_out += results.len() as u64;
-                prop_assert!(results.iter().map(|r| *r.shard()).eq(plan(iteration, shards)));
+                prop_assert!(results.iter().map(|(r, _)| *r.shard()).eq(plan(iteration, shards)));
                 iteration += 1;
                 ledger.open(plan(iteration, shards)).unwrap();
             }
@@ -241,8 +260,8 @@ proptest! {
         for actor in 0..3 {
             ledger.drop_actor(SessionId(actor));
         }
-        while let Some(lease) = ledger.lease(SessionId(9)) {
-            prop_assert_eq!(ledger.complete(SessionId(9), lease.id, result(lease.shard)), Ok(Verdict::Accepted));
+        while let Some(lease) = ledger.next(SessionId(9)) {
+            prop_assert_eq!(ledger.complete(SessionId(9), lease.id, result(lease.shard), origin(SessionId(9))), Ok(Verdict::Accepted));
         }
         let results = ledger.take();
         prop_assert_eq!(results.map(|r| r.len()), Some(shards as usize));
@@ -251,4 +270,140 @@ proptest! {
         prop_assert_eq!((ledger.episodes().residual, ledger.episodes().outstanding), (0, 0));
         prop_assert!(ledger.counters().trained >= handed_out + u64::from(shards));
     }
+}
+
+/// An actor that has room at this time.
+fn asker(session: SessionId, now: Instant) -> Asker {
+    Asker { session, process: session.0, now }
+}
+
+#[test]
+fn a_late_shard_is_leased_once_more_and_the_first_result_counts() {
+    let mut ledger = opened(2);
+    let start = Instant::now();
+    let [first, second] = [A, B].map(|session| ledger.lease(asker(session, start), Vec::new).unwrap());
+    assert_eq!(ledger.lease(asker(B, start + LEASE / 2), Vec::new), None, "nothing is known of durations yet");
+    assert_eq!(
+        ledger.complete(B, second.id, result(second.shard), (origin(B).0, start + LEASE / 10)),
+        Ok(Verdict::Accepted)
+    );
+    // Shards of this kind take a tenth of a lease, as far as is known.
+    assert_eq!(ledger.next_late(B.0), Some(start + LEASE / 5));
+    assert_eq!(ledger.next_late(A.0), None, "it holds the shard");
+    assert_eq!(ledger.lease(asker(B, start + LEASE / 6), Vec::new), None);
+    assert_eq!(ledger.lease(asker(A, start + LEASE), Vec::new), None, "not to the process that has it");
+    let again = ledger.lease(asker(B, start + LEASE / 5), Vec::new).unwrap();
+    assert_eq!(again.shard, first.shard);
+    assert_eq!(ledger.lease(asker(SessionId(3), start + LEASE / 4), Vec::new), None, "the second lease is not late");
+    assert_eq!(ledger.complete(B, again.id, result(again.shard), origin(B)), Ok(Verdict::Accepted));
+    assert_eq!(ledger.complete(A, first.id, result(first.shard), origin(A)), Ok(Verdict::Duplicate));
+    let counters = ledger.counters();
+    assert_eq!((counters.leased, counters.trained, counters.duplicate, counters.residual), (3, 2, 1, 0));
+    assert!(ledger.take().is_some());
+}
+
+#[test]
+fn a_shard_that_was_given_back_goes_to_another_with_room_first() {
+    let mut ledger = opened(1);
+    let now = Instant::now();
+    let lease = ledger.lease(asker(A, now), Vec::new).unwrap();
+    assert!(ledger.give_back(A, lease.id));
+    assert_eq!(ledger.lease(asker(A, now), || vec![B.0]), None, "B has room");
+    let lease = ledger.lease(asker(B, now), || vec![A.0]).unwrap();
+    assert!(ledger.give_back(B, lease.id));
+    assert!(ledger.lease(asker(A, now), || vec![B.0]).is_some(), "both gave it back");
+}
+
+/// A result with a digest of its own.
+fn sent(session: SessionId, digest: &str) -> (Origin, Instant) {
+    (Origin { digest: digest.into(), ..origin(session).0 }, Instant::now())
+}
+
+fn checking(shards: u32, share: f64) -> Ledger {
+    let mut ledger = Ledger::new(0, LEASE, Sampling { key: 3, share });
+    ledger.open(plan(0, shards)).unwrap();
+    ledger
+}
+
+#[test]
+fn a_newcomers_result_is_computed_again_by_another_and_the_plan_does_not_wait_for_it() {
+    let mut ledger = checking(1, 1e-9);
+    let lease = ledger.next(A).unwrap();
+    assert_eq!(ledger.complete(A, lease.id, result(lease.shard), sent(A, "x")), Ok(Verdict::Accepted));
+    assert_eq!(ledger.next(A), None, "no process confirms its own results");
+    let check = ledger.next(B).unwrap();
+    assert_eq!(check.shard, lease.shard);
+    assert!(ledger.take().is_some(), "the plan is complete");
+    // The next one does wait: the weights of the check are gone after it.
+    ledger.open(plan(1, 1)).unwrap();
+    let next = ledger.next(B).unwrap();
+    ledger.complete(B, next.id, result(next.shard), sent(B, "y")).unwrap();
+    assert!(ledger.all_done() && ledger.take().is_none());
+    assert_eq!(ledger.complete(B, check.id, result(check.shard), sent(B, "x")), Ok(Verdict::Duplicate));
+    assert_eq!(ledger.checks.take_confirmed(), [(A.0, 0)]);
+    assert!(ledger.take().is_some());
+    assert_eq!((ledger.counters().residual, ledger.checks.totals.same), (0, 1));
+}
+
+#[test]
+fn results_that_differ_are_a_case_for_the_learners_host() {
+    let mut ledger = checking(1, 1e-9);
+    let lease = ledger.next(A).unwrap();
+    ledger.complete(A, lease.id, result(lease.shard), sent(A, "wrong")).unwrap();
+    let now = Instant::now();
+    assert!(ledger.checks.case(&[A.0, B.0], |_| None, now).is_none(), "B can compute it");
+    assert!(ledger.checks.case(&[A.0], |_| None, now).is_some(), "no other actor is there");
+    assert!(ledger.checks.case(&[A.0, B.0], |_| Some(Duration::ZERO), now).is_some(), "and no other actor has done it");
+    let check = ledger.next(B).unwrap();
+    ledger.complete(B, check.id, result(check.shard), sent(B, "right")).unwrap();
+    let case = ledger.checks.case(&[A.0, B.0], |_| None, now).unwrap();
+    let wrong = ledger.checks.decide(&case.shard, Some("right"));
+    assert_eq!(wrong.iter().map(|origin| origin.process).collect::<Vec<_>>(), [A.0]);
+    assert_eq!(ledger.checks.take_confirmed(), [(B.0, 0)]);
+}
+
+#[test]
+fn a_late_second_result_confirms_or_accuses_without_a_check() {
+    for (digest, accused) in [("same", false), ("other", true)] {
+        let mut ledger = checking(1, 0.0);
+        let now = Instant::now();
+        let slow = ledger.lease(asker(A, now), Vec::new).unwrap();
+        let quick = ledger.lease(asker(B, now + LEASE), Vec::new).unwrap();
+        ledger.complete(B, quick.id, result(quick.shard), sent(B, "same")).unwrap();
+        ledger.complete(A, slow.id, result(slow.shard), sent(A, digest)).unwrap();
+        assert_eq!(ledger.checks.case(&[A.0, B.0], |_| None, now).is_some(), accused);
+        assert_eq!(ledger.checks.take_confirmed().len(), usize::from(!accused));
+    }
+}
+
+/// Shards of a process that computes wrongly after its 1,000th until it is found, with two honest ones beside it.
+fn found_after(key: u64) -> u32 {
+    let mut ledger = Ledger::new(0, LEASE, Sampling { key, share: 0.01 });
+    let mut order = magex_core::rng::Key::new(key, magex_core::rng::Purpose::Bench, &[]).stream();
+    let mut made = 0;
+    for iteration in 0.. {
+        ledger.open(plan(iteration, 12)).unwrap();
+        // Checks go over into the next plan, as in a run.
+        while !ledger.is_complete() {
+            let session = SessionId(1 + u64::from(order.below(3)));
+            let Some(lease) = ledger.next(session) else { continue };
+            made += u32::from(session == A);
+            let digest = if session == A && made > 1000 { "wrong" } else { "right" };
+            ledger.complete(session, lease.id, result(lease.shard), sent(session, digest)).unwrap();
+            if ledger.checks.case(&[1, 2, 3], |_| None, Instant::now()).is_some() {
+                return made - 1000;
+            }
+        }
+        ledger.take().unwrap();
+    }
+    unreachable!("the loop has no end")
+}
+
+#[test]
+fn an_actor_that_begins_to_compute_wrongly_is_found_within_300_shards_in_19_of_20_cases() {
+    let mut shards: Vec<u32> = (1..=400).map(found_after).collect();
+    shards.sort_unstable();
+    let at = |share: f64| shards[(share * shards.len() as f64) as usize];
+    println!("found after {} shards in half of the cases, {} in 95 %, {} in 99 %", at(0.5), at(0.95), at(0.99));
+    assert!(at(0.95) <= 300, "{shards:?}");
 }

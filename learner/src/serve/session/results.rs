@@ -1,9 +1,10 @@
 //! The end of a lease: its result arrives, or the actor returns it without one.
 
-use super::{Session, SessionEnd};
+use super::{PROBE, Session, SessionEnd};
+use crate::collector::Origin;
 use crate::run_events::describe;
 use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure};
-use crate::serve::metrics::steps_of;
+use crate::serve::metrics::{Rejection, steps_of};
 use crate::serve::validate::validate;
 use bytes::Bytes;
 use magex_core::error::FieldError;
@@ -12,7 +13,8 @@ use magex_core::trajectory::ShardResult;
 use magex_proto::v1;
 use magex_proto::v1::rollout_response::Message as Response;
 use magex_runtime::{status, trace};
-use std::time::{Duration, Instant};
+use std::time::Duration;
+use tokio::time::Instant;
 use tonic::Status;
 use tracing::{Instrument as _, Span};
 
@@ -31,10 +33,16 @@ impl Session {
     pub(super) fn on_failed(&mut self, failed: &v1::Failed) -> Result<(), SessionEnd> {
         let lease = LeaseId(failed.lease_id);
         let (reason, retryable) = (failed.reason.as_str(), failed.retryable);
-        tracing::warn!(actor = self.actor_id, reason, retryable, "actor returned a lease");
+        if self.hand_backs < 2 {
+            tracing::warn!(actor = &*self.actor_id, reason, retryable, "actor returned a lease");
+        } else {
+            tracing::debug!(actor = &*self.actor_id, reason, retryable, "actor returned a lease");
+        }
         self.granted.remove(&lease);
         if retryable {
-            self.shared.work.with_ledger(|ledger| ledger.give_back(self.id, lease));
+            if self.shared.work.with_ledger(|ledger| ledger.give_back(self.id, lease)) {
+                self.on_hand_back(reason);
+            }
             return Ok(());
         }
         let connected = self.shared.roster.connected_processes();
@@ -49,6 +57,33 @@ impl Session {
         let quoted: String = reason.chars().take(MAX_QUOTED).collect();
         let problem = format!("{quoted} ({} shards in a row failed at this actor)", self.failed);
         Err(SessionEnd::Refused(status::invalid_argument("failed", problem)))
+    }
+
+    /// An actor that gives its leases back computes nothing, but each of them costs the others time.
+    fn on_hand_back(&mut self, reason: &str) {
+        self.hand_backs = self.hand_backs.saturating_add(1);
+        if self.hand_backs < 2 {
+            return;
+        }
+        let pause = PROBE.min(self.shared.lease_time());
+        self.probe = Some(Instant::now() + pause);
+        if self.hand_backs == 2 {
+            tracing::warn!(
+                actor = &*self.actor_id,
+                reason,
+                pause_s = pause.as_secs_f64(),
+                "an actor gives its leases back; it gets one at a time, after a pause, until it delivers"
+            );
+        }
+    }
+
+    /// The actor has delivered.
+    fn on_delivery(&mut self) {
+        self.failed = 0;
+        if self.hand_backs >= 2 {
+            tracing::info!(actor = &*self.actor_id, given_back = self.hand_backs, "an actor delivers again");
+        }
+        (self.hand_backs, self.probe) = (0, None);
     }
 
     pub(super) async fn on_part(&mut self, message: v1::ResultPart) -> Result<(), SessionEnd> {
@@ -86,8 +121,13 @@ impl Session {
             Span::none,
             |granted| tracing::info_span!(target: trace::TARGET, parent: &granted.span, "ingest", bytes = bytes.len()),
         );
-        let result = match self.validate(bytes).instrument(span.clone()).await {
-            Ok(result) => result,
+        let (result, origin) = match self.validate(bytes).instrument(span.clone()).await {
+            Ok(Some(valid)) => valid,
+            Ok(None) => {
+                // Made with weights that the run has gone back on.
+                self.shared.work.with_ledger(|ledger| ledger.withdraw(self.id, lease));
+                return self.acknowledge(lease, v1::Verdict::Duplicate, String::new()).await;
+            }
             Err(error) => {
                 self.shared.work.with_ledger(|ledger| ledger.reject(self.id, lease));
                 return self.reject(lease, error).await;
@@ -97,13 +137,14 @@ impl Session {
         // The ledger and the timing change under one lock, because the last result of a plan wakes the training thread, which
         // reads both.
         let verdict = self.shared.work.update(|open| {
-            let verdict = open.ledger.complete(self.id, lease, result);
+            let now = Instant::now();
+            let verdict = open.ledger.complete(self.id, lease, result, (origin, now));
             if verdict == Ok(v1::Verdict::Accepted) {
-                let now = Instant::now();
                 // The grant of a lease of an earlier session is unknown, and so is its duration.
                 let since_grant = granted.as_ref().map_or(Duration::ZERO, |granted| now - granted.since);
                 let reported = timing.filter(|_| granted.is_some());
-                open.timing.result_accepted(shard.kind == ShardKind::Train, since_grant, reported, now);
+                open.timing.result_accepted(shard.kind == ShardKind::Train, since_grant, reported, now.into_std());
+                self.shared.status.progressed();
                 self.shared.metrics.accepted(steps);
             }
             verdict
@@ -112,23 +153,27 @@ impl Session {
             Ok(verdict) => verdict,
             Err(error) => return self.reject(lease, error).await,
         };
-        self.failed = 0;
+        self.on_delivery();
         if verdict == v1::Verdict::Accepted {
             self.shared.roster.update(self.id, |actor| {
                 actor.status.shards_done += 1;
                 actor.status.weights_version = Some(shard.version.0);
             });
         } else {
-            tracing::debug!(actor = self.actor_id, shard = describe(&shard), "dropped a duplicate");
+            tracing::debug!(actor = &*self.actor_id, shard = describe(&shard), "dropped a duplicate");
         }
         self.acknowledge(lease, verdict, String::new()).await
     }
 
-    async fn validate(&self, bytes: Bytes) -> Result<ShardResult, FieldError> {
+    /// A valid result with its origin; `None` if it was made with weights that the run has gone back on.
+    async fn validate(&self, bytes: Bytes) -> Result<Option<(ShardResult, Origin)>, FieldError> {
         let shared = self.shared.clone();
         let short = bytes.len() <= DECODE_INLINE;
-        let check = move || validate(&shared.limits, &shared.run.run_id, bytes);
-        let delivery = if short {
+        let check = move || {
+            let digest = Origin::digest_of(&bytes);
+            validate(&shared.limits, &shared.run.run_id, bytes).map(|delivery| (delivery, digest))
+        };
+        let (delivery, digest) = if short {
             check()
         } else {
             let stopping = || FieldError::new("result", "the learner is shutting down");
@@ -138,11 +183,17 @@ impl Session {
         let version = delivery.result.shard().version;
         match self.shared.board.sha256(version) {
             Some(own) if own != delivery.weights_sha256 => {
+                if self.shared.board.is_withdrawn(&delivery.weights_sha256) {
+                    return Ok(None);
+                }
                 let theirs = &delivery.weights_sha256;
                 let problem = format!("actor used {theirs} as version {version}, learner published {own}");
                 Err(FieldError::new("weights_sha256", problem))
             }
-            _ => Ok(delivery.result),
+            _ => {
+                let origin = Origin { actor: self.actor_id.clone(), process: self.process_id, digest };
+                Ok(Some((delivery.result, origin)))
+            }
         }
     }
 
@@ -151,7 +202,8 @@ impl Session {
         self.granted.remove(&lease);
         self.shared.work.with_ledger(|ledger| ledger.reject(self.id, lease));
         self.damaged += 1;
-        tracing::warn!(actor = self.actor_id, reason, "a result arrived damaged; its shard is queued again");
+        self.shared.metrics.rejected(Rejection::Damaged);
+        tracing::warn!(actor = &*self.actor_id, reason, "a result arrived damaged; its shard is queued again");
         self.acknowledge(lease, v1::Verdict::Rejected, reason.clone()).await?;
         if self.damaged < MAX_REJECTED {
             return Ok(());
@@ -162,7 +214,8 @@ impl Session {
 
     async fn reject(&mut self, lease: LeaseId, error: FieldError) -> Result<(), SessionEnd> {
         self.rejected += 1;
-        tracing::warn!(actor = self.actor_id, reason = %error, "rejected a result; its shard is queued again");
+        self.shared.metrics.rejected(Rejection::Receipt);
+        tracing::warn!(actor = &*self.actor_id, reason = %error, "rejected a result; its shard is queued again");
         self.acknowledge(lease, v1::Verdict::Rejected, error.to_string()).await?;
         if self.rejected < MAX_REJECTED {
             return Ok(());

@@ -1,6 +1,7 @@
 use super::*;
 use crate::fixtures;
 use crate::run_identity::RunIdentity;
+use crate::serve::judge::Judge;
 use crate::serve::validate::Limits;
 use crate::serve::weights_board::Weights;
 use bytes::Bytes;
@@ -126,7 +127,8 @@ async fn a_damaged_result_takes_its_lease_with_it() {
 
 /// Leases a shard and fails it permanently; whether the actor stays.
 fn fail(session: &mut Session) -> bool {
-    let lease = session.shared.work.with_ledger(|ledger| ledger.lease(session.id)).unwrap();
+    let asker = Asker { session: session.id, process: session.process_id, now: Instant::now() };
+    let lease = session.shared.work.with_ledger(|ledger| ledger.lease(asker, Vec::new)).unwrap();
     let failed = v1::Failed { lease_id: lease.id.0, reason: "no luck".into(), ..Default::default() };
     session.on_failed(&failed).is_ok()
 }
@@ -148,6 +150,6 @@ async fn of_several_failing_actors_one_stays_and_the_failing_shard_is_given_up()
     for _ in 0..3 {
         assert!(fail(&mut b), "the last actor is not evicted");
     }
-    let error = shared.wait().unwrap_err();
+    let error = shared.wait(&mut Judge::default()).unwrap_err();
     assert!(error.to_string().contains("no luck"), "{error}");
 }
