@@ -93,7 +93,8 @@ pub fn cost_of_points(agents: &[f32], goals: &[f32], dims: usize, goal_of: &[u32
     total
 }
 
-pub(crate) fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
+/// Sum with Neumaier's compensation.
+pub fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
     let (mut sum, mut lost) = (0.0f64, 0.0f64);
     for term in terms {
         let next = sum + term;

@@ -171,7 +171,9 @@ fn quality_rows(report: &mut Report, args: &AssignArgs, weights: &[u8], config: 
 
 fn team(n: usize, index: u32, scheduler: v1::AssignmentMethod) -> v1::AssignRequest {
     let (agents, goals) = uniform_points(n, index);
-    let points = |coordinates| Some(v1::Positions { dims: 2, coordinates, array: None });
+    let points = |points: Vec<f32>| {
+        Some(v1::Positions { dims: 2, coordinates: points.into_iter().map(f64::from).collect(), array: None })
+    };
     let scheduler = scheduler.into();
     v1::AssignRequest { agents: points(agents), goals: points(goals), scheduler, ..Default::default() }
 }
@@ -185,7 +187,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     let mut service = many.block_on(Service::new("commander", &arguments, folder).start())?;
     let url = format!("http://{}", service.address);
     for (kind, name, must, aim) in [
-        (v1::AssignmentMethod::Exact, "EXACT_TOTAL", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
+        (v1::AssignmentMethod::Exact, "EXACT", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
         (v1::AssignmentMethod::Learned, "LEARNED", ["2 / 8 ms", "800/s"], ["0.6 / 2 ms", "4,000/s"]),
     ] {
         let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, kind)).collect();
@@ -215,9 +217,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     many.block_on(service.stop());
     let mut service = many.block_on(Service::new("commander", &arguments[..3], folder).start())?;
     let url = format!("http://{}", service.address);
-    for (kind, name) in
-        [(v1::AssignmentMethod::Exact, "EXACT_TOTAL"), (v1::AssignmentMethod::Makespan, "EXACT_MAKESPAN")]
-    {
+    for (kind, name) in [(v1::AssignmentMethod::Exact, "EXACT"), (v1::AssignmentMethod::Makespan, "MAKESPAN")] {
         let [seconds, ..] = one.block_on(one_client(&url, &[team(5000, 0, kind)], 1, kind))?;
         let (seconds, peak) = (seconds / 1e3, memory_mib(service.id(), "VmHWM:"));
         let text = format!("{seconds:.1} s, {peak:.0} MiB");

@@ -6,9 +6,11 @@
 mod assign;
 mod cli;
 mod cluster;
+mod endless;
 mod env;
 mod fleet;
 mod goals;
+mod powers;
 mod report;
 mod runs;
 mod soak;

@@ -7,9 +7,10 @@
 mod sticky;
 
 use crate::UNASSIGNED;
+use crate::costs::{Obstacle, PairTerms};
 use crate::problem::Problem;
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy, pairs};
+use magex_assign::{AssignError, BottleneckSolver, Solver, compensated_sum, greedy, pairs};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use std::cell::RefCell;
@@ -33,10 +34,12 @@ pub struct Plan {
     pub cost: f64,
     /// Smallest possible summed cost, if it was computed in time and the answer has as many pairs.
     pub exact_cost: Option<f64>,
-    /// `[N]` cost of each agent's pair; 0 without one.
-    pub pair_costs: Vec<f64>,
-    /// Agents, and goals, whose pairs are all forbidden, ascending.
-    pub isolated: [Vec<u32>; 2],
+    /// The part of the cost that is of goals without an agent; 0 unless weights differ.
+    pub unserved_cost: f64,
+    /// `[N]` cost and arrival of each agent's pair; 0 without one.
+    pub pairs: Vec<PairTerms>,
+    /// What stands in the way of every agent, and of every goal; empty if nothing does.
+    pub obstacles: [Vec<Option<Obstacle>>; 2],
 }
 
 /// Buffers that are reused from problem to problem.
@@ -46,6 +49,8 @@ struct Workspace {
     makespan: BottleneckSolver,
     costs: Vec<f64>,
     adjusted: Vec<f64>,
+    /// Costs without weights.
+    unweighted: Vec<f64>,
 }
 
 thread_local! {
@@ -74,17 +79,28 @@ pub fn solve(
         return Ok(nothing(problem, kind));
     }
     with_workspace(problem, |workspace| {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
-        problem.costs_into(&mut workspace.costs)?;
+        let (rows, cols) = (problem.agent_count, problem.place_count());
+        problem.costs_into(&mut workspace.costs);
         let sticky = workspace.adjust(problem);
-        let Workspace { solver, makespan, costs, adjusted } = workspace;
+        let Workspace { solver, makespan, costs, adjusted, unweighted } = workspace;
         let target: &[f64] = if sticky { adjusted } else { costs };
-        let mut exact_cost = None;
-        let (goal_of, scheduler) = match kind {
+        let (place_of, scheduler) = match kind {
             AssignmentMethod::Exact | AssignmentMethod::Learned => {
-                let answer = solver.solve_allowed(target, rows, cols, should_continue)?;
-                exact_cost = (!sticky).then_some(answer.cost);
-                (answer.col_of_row, AssignmentMethod::Exact)
+                (solver.solve_allowed(target, rows, cols, should_continue)?.col_of_row, AssignmentMethod::Exact)
+            }
+            AssignmentMethod::Makespan if problem.terms.weighted() => {
+                problem.unweighted_into(unweighted);
+                if sticky {
+                    favour(unweighted, cols, problem);
+                }
+                let largest = largest(
+                    unweighted,
+                    cols,
+                    &makespan.solve_allowed(unweighted, rows, cols, should_continue)?.col_of_row,
+                );
+                let within = |(cost, first): (&f64, &f64)| if *first <= largest { *cost } else { f64::INFINITY };
+                let second: Vec<f64> = target.iter().zip(unweighted.iter()).map(within).collect();
+                (solver.solve_allowed(&second, rows, cols, should_continue)?.col_of_row, kind)
             }
             AssignmentMethod::Makespan => {
                 (makespan.solve_allowed(target, rows, cols, should_continue)?.col_of_row, kind)
@@ -95,15 +111,17 @@ pub fn solve(
                 (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
             }
         };
-        workspace.finish(problem, Plan { goal_of, scheduler, exact_cost, ..Plan::default() }, should_continue)
+        let proven = scheduler == AssignmentMethod::Exact && !sticky;
+        let plan = Plan { goal_of: goals_of(problem, place_of), scheduler, ..Plan::default() };
+        workspace.finish(problem, plan, proven, should_continue)
     })
 }
 
 /// The plan of a team without agents or without goals: all others are left over, at no cost, whatever the method.
 fn nothing(problem: &Problem, kind: AssignmentMethod) -> Plan {
     let scheduler = if kind == AssignmentMethod::Learned { AssignmentMethod::Exact } else { kind };
-    let (goal_of, pair_costs) = (vec![UNASSIGNED; problem.agent_count], vec![0.0; problem.agent_count]);
-    Plan { goal_of, scheduler, exact_cost: Some(0.0), pair_costs, ..Plan::default() }
+    let (goal_of, pairs) = (vec![UNASSIGNED; problem.agent_count], vec![PairTerms::default(); problem.agent_count]);
+    Plan { goal_of, scheduler, exact_cost: Some(0.0), pairs, ..Plan::default() }
 }
 
 /// Makes a plan of the answer of the learned method. An error is the reason of a fallback.
@@ -117,7 +135,7 @@ pub fn adopt(
     let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
     with_workspace(problem, |workspace| {
         let cols = problem.goal_count;
-        problem.costs_into(&mut workspace.costs).map_err(|error| error.to_string())?;
+        problem.costs_into(&mut workspace.costs);
         let costs = &workspace.costs;
         if let Some((agent, goal)) = pairs(&wish).find(|(agent, goal)| costs[agent * cols + goal] == f64::INFINITY) {
             return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
@@ -129,8 +147,13 @@ pub fn adopt(
 
 /// Why the learned method does not support a problem.
 pub fn not_for_learned(problem: &Problem) -> Option<&'static str> {
-    if problem.matrix.is_some() || !problem.overrides.is_empty() {
+    if problem.matrix.is_some() || problem.only_overrides || !problem.overrides.is_empty() {
         return Some("the learned scheduler supports positions only, not costs");
+    }
+    if !problem.terms.plain() {
+        return Some(
+            "the learned scheduler knows distances only: no power, speeds, offsets, weights, capacities or times",
+        );
     }
     if problem.cells() == 0 {
         return Some("without agents or without goals there is nothing to choose");
@@ -163,66 +186,90 @@ impl Workspace {
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
         let scheduler = AssignmentMethod::Learned;
-        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, should_continue)
+        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, false, should_continue)
     }
 
     /// Fills the adjusted costs if there are current pairs.
     fn adjust(&mut self, problem: &Problem) -> bool {
         let Self { costs, adjusted, .. } = self;
-        let cols = problem.goal_count;
         if problem.current.iter().all(|&goal| goal == UNASSIGNED) {
             return false;
         }
         adjusted.clear();
         adjusted.extend_from_slice(costs);
-        sticky::favour(adjusted, cols, &problem.current, problem.switching_cost);
+        favour(adjusted, problem.place_count(), problem);
         true
     }
 
-    /// Fills in the costs of a matching.
+    /// Fills in the costs of a matching. `proven`: no other costs less.
     fn finish(
         &mut self,
         problem: &Problem,
         mut plan: Plan,
+        proven: bool,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Plan, AssignError> {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
+        let (rows, cols) = (problem.agent_count, problem.place_count());
         let Self { solver, costs, .. } = self;
-        plan.cost = cost_of(costs, cols, &plan.goal_of);
-        if plan.exact_cost.is_none() && rows * cols <= GAP_CELLS {
+        let longest = if problem.terms.weighted() { problem.costs_into(costs) } else { 0.0 };
+        plan.pairs = problem.pair_terms(&plan.goal_of);
+        plan.unserved_cost = unserved(problem, longest, &plan.goal_of);
+        plan.cost = total(&plan.pairs, plan.unserved_cost);
+        if proven {
+            plan.exact_cost = Some(plan.cost);
+        } else if rows * cols <= GAP_CELLS {
             match solver.solve_allowed(costs, rows, cols, should_continue) {
                 Ok(exact) if exact.pairs().count() == pairs(&plan.goal_of).count() => {
-                    plan.exact_cost = Some(exact.cost)
+                    let goal_of = goals_of(problem, exact.col_of_row);
+                    let cost = total(&problem.pair_terms(&goal_of), unserved(problem, longest, &goal_of));
+                    plan.exact_cost = Some(cost);
                 }
                 // The answer is complete; only its gap is missing.
                 Ok(_) | Err(AssignError::Interrupted) => {}
                 Err(other) => return Err(other),
             }
         }
-        plan.pair_costs = vec![0.0; rows];
-        pairs(&plan.goal_of).for_each(|(agent, goal)| plan.pair_costs[agent] = costs[agent * cols + goal]);
-        if !problem.forbidden.is_empty() {
-            plan.isolated = isolated(costs, cols);
+        if problem.forbids() && pairs(&plan.goal_of).count() < rows.max(problem.goal_count) {
+            plan.obstacles = problem.obstacles();
         }
         Ok(plan)
     }
 }
 
-/// Agents, and goals, whose pairs are all forbidden.
-fn isolated(costs: &[f64], cols: usize) -> [Vec<u32>; 2] {
-    let (mut agents, mut lonely) = (Vec::new(), vec![true; cols]);
-    for (agent, row) in (0u32..).zip(costs.chunks_exact(cols)) {
-        let mut allowed = false;
-        for (cost, lonely) in row.iter().zip(&mut lonely) {
-            if *cost < f64::INFINITY {
-                (allowed, *lonely) = (true, false);
-            }
-        }
-        if !allowed {
-            agents.push(agent);
+/// Makes the current pairs cheaper.
+fn favour(costs: &mut [f64], cols: usize, problem: &Problem) {
+    sticky::favour(costs, cols, &problem.current_places(), problem.switching_cost);
+}
+
+/// The goal of each agent's place.
+fn goals_of(problem: &Problem, mut place_of: Vec<u32>) -> Vec<u32> {
+    if let Some(places) = problem.places() {
+        for place in place_of.iter_mut().filter(|place| **place != UNASSIGNED) {
+            *place = places[*place as usize];
         }
     }
-    [agents, (0u32..).zip(lonely).filter_map(|(goal, lonely)| lonely.then_some(goal)).collect()]
+    place_of
+}
+
+/// The largest cost of a matching; −∞ of none.
+fn largest(costs: &[f64], cols: usize, col_of_row: &[u32]) -> f64 {
+    pairs(col_of_row).map(|(row, col)| costs[row * cols + col]).fold(f64::NEG_INFINITY, f64::max)
+}
+
+fn total(pairs: &[PairTerms], unserved: f64) -> f64 {
+    compensated_sum(pairs.iter().map(|pair| pair.cost).chain([unserved]))
+}
+
+/// What the places cost that no agent gets, at `longest` per unit of weight.
+fn unserved(problem: &Problem, longest: f64, goal_of: &[u32]) -> f64 {
+    if longest == 0.0 {
+        return 0.0;
+    }
+    let terms = &problem.terms;
+    let mut free: Vec<u32> =
+        (0..problem.goal_count).map(|goal| terms.capacity(goal).min(problem.agent_count as u32)).collect();
+    pairs(goal_of).for_each(|(_, goal)| free[goal] -= 1);
+    compensated_sum((0..problem.goal_count).map(|goal| f64::from(free[goal]) * terms.weight(goal) * longest))
 }
 
 /// Checks that the answer is a matching of min(N, G) pairs.

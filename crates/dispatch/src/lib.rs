@@ -9,11 +9,13 @@
 
 pub mod answer;
 pub mod clock;
+pub mod costs;
 pub mod disk;
 pub mod engine;
 pub mod mission;
 pub mod missions;
 pub mod problem;
+pub mod terms;
 
 pub use magex_assign::{AssignError, UNASSIGNED};
 pub use problem::{Limits, Problem};

@@ -61,8 +61,8 @@ fn nothing_but_zeros_changes_nothing() {
     }
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 /// A model that sends agent k to goal k + 1.

@@ -43,7 +43,7 @@ impl Drop for Service {
 }
 
 fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 fn mission() -> v1::CreateMissionRequest {

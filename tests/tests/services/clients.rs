@@ -15,7 +15,7 @@ use tonic_health::pb::health_client::HealthClient;
 use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus};
 use tonic_types::StatusExt as _;
 
-pub(crate) fn positions(coordinates: &[f32]) -> Option<v1::Positions> {
+pub(crate) fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
     Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
 }
 

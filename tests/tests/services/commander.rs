@@ -21,7 +21,7 @@ async fn health(client: &mut HealthClient<Channel>) -> ServingStatus {
     client.check(HealthCheckRequest { service: String::new() }).await.unwrap().into_inner().status()
 }
 
-fn positions(coordinates: &[f32]) -> Option<v1::Positions> {
+fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
     Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
 }
 

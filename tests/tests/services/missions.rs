@@ -16,7 +16,7 @@ use tonic_types::StatusExt as _;
 type Client = CommanderServiceClient<Channel>;
 
 fn member(id: &str, position: [f32; 2]) -> v1::Member {
-    v1::Member { id: id.into(), position: position.to_vec(), state: 0 }
+    v1::Member { id: id.into(), position: position.to_vec(), ..Default::default() }
 }
 
 /// Two robots and two tasks, each pair a unit apart.
@@ -92,7 +92,7 @@ async fn a_mission_is_created_watched_updated_and_deleted() {
     assert!((crossed.saving.unwrap() - 12.0).abs() < 1e-5, "{:?}", crossed.saving);
     // Another mission is none of this watcher's business.
     update(&mut client, moved(&drawn, vec![])).await;
-    let failed = v1::Member { id: "r2".into(), position: vec![], state: v1::MemberState::Failed.into() };
+    let failed = v1::Member { id: "r2".into(), state: v1::MemberState::Failed.into(), ..Default::default() };
     let left = update(&mut client, moved("site", vec![failed])).await;
     assert_eq!(left.goals_without_agent[0].id, "t1");
     for revision in 2..=4 {
