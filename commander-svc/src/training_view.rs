@@ -107,6 +107,7 @@ impl TrainingShard {
             title: format!("{part} episode {episode} of run {run_id}"),
             source: v1::MissionSource::Training.into(),
             revision: 1,
+            power: 1.0,
             agents: members(problem.agent_ids, &problem.agents),
             goals: members(problem.goal_ids, &problem.goals),
             pairs: answer.pairs,

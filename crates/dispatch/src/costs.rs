@@ -10,6 +10,10 @@ use magex_core::power::raised;
 /// Largest magnitude of a coordinate: squares of differences stay finite.
 pub(crate) const LARGEST_COORDINATE: f64 = 1e100;
 
+/// A goal that no agent gets counts as served after this many of the longest ways of the team: the one that its agent makes now,
+/// and the one to it. So a goal of twice the weight or more goes first, however far it is (power 1).
+const UNSERVED: f64 = 2.0;
+
 /// Euclidean distance of two points.
 pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
@@ -133,7 +137,7 @@ impl Problem {
                 longest = if *cost < f64::INFINITY { longest.max(*cost) } else { longest };
             }
         }
-        let unserved = if weighted && terms.weighted() { raised(longest, terms.power) } else { 0.0 };
+        let unserved = if weighted && terms.weighted() { raised(UNSERVED * longest, terms.power) } else { 0.0 };
         for row in costs.chunks_exact_mut(self.goal_count) {
             for (goal, cost) in row.iter_mut().enumerate().filter(|(_, cost)| **cost < f64::INFINITY) {
                 *cost = raised(*cost, terms.power) - unserved;

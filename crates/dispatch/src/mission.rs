@@ -341,13 +341,16 @@ impl Mission {
 
     /// Forbids the pairs of agents that give their goals back.
     fn forfeit(&mut self, agents: &[String]) -> Result<HashSet<String>, AssignError> {
+        let known = |members: &[v1::Member], id: &str| members.iter().any(|member| member.id == id);
         for (k, id) in agents.iter().enumerate() {
             let pair = self.assignment.pairs.iter().find(|pair| pair.agent_id == *id);
             let pair =
                 pair.ok_or_else(|| AssignError::invalid(format!("forfeit[{k}]"), "no agent of this name has a goal"))?;
             let names = (pair.agent_id.clone(), pair.goal_id.clone());
             self.pinned.remove(&names);
-            self.forbidden.insert(names);
+            if known(&self.assignment.agents, &names.0) && known(&self.assignment.goals, &names.1) {
+                self.forbidden.insert(names);
+            }
         }
         Ok(agents.iter().cloned().collect())
     }

@@ -214,7 +214,8 @@ impl Problem {
             .fold(given, |a, b| a.max(b.abs()));
         let slowest = terms.speeds.iter().copied().fold(1.0, f64::min);
         let time = most(&terms.offsets) + d / slowest + most(&terms.earliest);
-        let cost = raised(time, terms.power) * most(&terms.weights).max(1.0);
+        // Goals that are left over count twice the longest time.
+        let cost = raised(2.0 * time, terms.power) * most(&terms.weights).max(1.0);
         ConvertError::ensure(cost <= LARGEST_COST, || {
             let problem = format!(
                 "a pair may take {time:e} by distance, speed and offset; raised to {} and weighted that is beyond {LARGEST_COST:e}; \

@@ -288,8 +288,8 @@ fn a_goal_of_high_priority_is_served_first_and_from_nearer() {
     };
     assert_eq!(chosen(&ask(team(vec![]))), [(0, 0)]);
     let answer = ask(team(vec![1.0, 5.0]));
-    // 5 · 2, and goal 0 waits: 1 · 2.
-    assert_eq!((chosen(&answer), answer.cost, answer.unserved_cost), (vec![(0, 1)], 12.0, 2.0));
+    // 5 · 2, and goal 0 waits: 1 · 2 · 2.
+    assert_eq!((chosen(&answer), answer.cost, answer.unserved_cost), (vec![(0, 1)], 14.0, 4.0));
 }
 
 #[test]

@@ -305,7 +305,7 @@ proptest! {
             let members = |side: &str, list: &[(u8, i8, i8, i32)]| -> Vec<v1::Member> {
                 list.iter()
                     .map(|&(k, x, y, state)| v1::Member {
-                        id: format!("{side}{k}"), position: vec![f64::from(x), f64::from(y)], state,
+                        id: format!("{side}{k}"), position: vec![f64::from(x), f64::from(y)], state, ..Default::default()
                     })
                     .collect()
             };

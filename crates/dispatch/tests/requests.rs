@@ -205,12 +205,12 @@ fn a_model_that_gives_nonsense_is_found_out() {
         forbidden: vec![by_index(0, 1)],
         ..team(&[0.0, 0.0, 1.0, 0.0], &[1.0, 0.5, 0.0, 0.5])
     });
-    let adopt = |goals: &[Option<u32>], p: Option<Vec<f64>>| engine::adopt(&problem, goals.to_vec(), p, &|| true);
+    let adopt = |goals: &[Option<u32>], p: Option<Vec<f32>>| engine::adopt(&problem, goals.to_vec(), p, &|| true);
     for wrong in [vec![Some(0), Some(0)], vec![Some(0), None], vec![Some(0), Some(2)], vec![Some(0)]] {
         assert!(adopt(&wrong, None).is_err(), "{wrong:?}");
     }
     assert!(adopt(&[Some(1), Some(0)], None).unwrap_err().contains("forbidden pair"));
-    assert!(adopt(&[Some(0), Some(1)], Some(vec![0.5, f64::NAN])).unwrap_err().contains("probability"));
+    assert!(adopt(&[Some(0), Some(1)], Some(vec![0.5, f32::NAN])).unwrap_err().contains("probability"));
     let plan = adopt(&[Some(0), Some(1)], Some(vec![0.5, 1.0])).unwrap();
     assert_eq!((plan.scheduler, plan.exact_cost.is_some()), (AssignmentMethod::Learned, true));
 }

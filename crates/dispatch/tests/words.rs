@@ -204,7 +204,7 @@ fn check(team: &v1::AssignRequest) -> bool {
     let times: Vec<f64> = (0..n * g).map(|cell| formula.time(cell / g, cell % g)).collect();
     let longest = times.iter().copied().filter(|time| *time < f64::INFINITY).fold(0.0, f64::max);
     let differ = team.goal_weights.iter().any(|weight| *weight != team.goal_weights[0]);
-    let unserved = if differ { raised(longest, team.power.unwrap_or(1.0)) } else { 0.0 };
+    let unserved = if differ { raised(2.0 * longest, team.power.unwrap_or(1.0)) } else { 0.0 };
     let mut plans = Vec::new();
     every_plan(n, g, &mut Vec::new(), &mut |goal_of| plans.extend(formula.score(goal_of, &times, unserved)));
     let most = plans.iter().map(|(pairs, ..)| *pairs).max().unwrap();

@@ -407,6 +407,12 @@ mod tests {
         let exact = Variation { scheduler: Some(CommanderPolicy::Exact), ..vary.clone() };
         exact.apply(&trained("[commander]\nkind = 'ranking'")).unwrap();
         let ranking = Variation { scheduler: Some(CommanderPolicy::Ranking), ..Variation::default() };
-        assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact, makespan, greedy or random"));
+        assert!(
+            ranking
+                .apply(&trained(""))
+                .unwrap_err()
+                .to_string()
+                .contains("use pairwise, exact, makespan, greedy or random")
+        );
     }
 }

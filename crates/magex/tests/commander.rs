@@ -42,7 +42,7 @@ impl Drop for Service {
     }
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
+fn member(id: &str, x: f64) -> v1::Member {
     v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 

@@ -15,7 +15,7 @@ use tonic_types::StatusExt as _;
 
 type Client = CommanderServiceClient<Channel>;
 
-fn member(id: &str, position: [f32; 2]) -> v1::Member {
+fn member(id: &str, position: [f64; 2]) -> v1::Member {
     v1::Member { id: id.into(), position: position.to_vec(), ..Default::default() }
 }
 
