@@ -5,6 +5,7 @@ mod load;
 use crate::goals::learned_ratio;
 use crate::report::Report;
 use crate::runs::Keep;
+use crate::solver::limits::limits;
 use crate::solver::{distances, time_exact, uniform_points};
 use crate::vitals::memory_mib;
 use load::{Flood, flood, one_client, saturate};
@@ -32,6 +33,9 @@ pub(crate) struct AssignArgs {
     /// Only the solver, without a service.
     #[arg(long)]
     solver: bool,
+    /// Only the solvers at their limits: ties, clusters, 20,000 agents.
+    #[arg(long)]
+    limits: bool,
     /// Calls of the latency rows.
     #[arg(long, value_name = "K", default_value_t = 5000, value_parser = settings::count)]
     calls: u32,
@@ -52,6 +56,10 @@ pub(crate) struct AssignArgs {
 pub(crate) fn assign(args: &AssignArgs) -> anyhow::Result<Report> {
     let title = "Goal assignment: the exact solver on one core, the learned scheduler, and the service on loopback";
     let mut report = Report::new("assign", title, 1, &["what", "measured", "must", "aim"]);
+    if args.limits {
+        limits(&mut report, &args.python)?;
+        return Ok(report);
+    }
     solver_rows(&mut report, args)?;
     if args.solver {
         return Ok(report);

@@ -9,7 +9,6 @@ pub mod ids;
 pub mod joint_state;
 pub mod keys;
 pub mod metrics_table;
-pub mod power;
 pub mod rng;
 pub mod sha256;
 pub mod statics;

@@ -5,33 +5,35 @@
 use crate::UNASSIGNED;
 use crate::problem::Problem;
 use crate::terms::Visit;
-use magex_core::power::raised;
-
-/// Largest magnitude of a coordinate: squares of differences stay finite.
-pub(crate) const LARGEST_COORDINATE: f64 = 1e100;
+use magex_assign::{powered, powered_square};
 
 /// A goal that no agent gets counts as served after this many of the longest ways of the team: the one that its agent makes now,
 /// and the one to it. So a goal of twice the weight or more goes first, however far it is (power 1).
 const UNSERVED: f64 = 2.0;
 
-/// Euclidean distance of two points.
-pub fn distance(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
+/// Squared distance of two points.
+fn square(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
-/// Distances `[N, G]` between agents `[N, dims]` and goals `[G, dims]`.
-fn distances_into(agents: &[f64], goals: &[f64], dims: usize, costs: &mut Vec<f64>) {
+/// Distances `[N, G]` between agents `[N, dims]` and goals `[G, dims]`, raised to a power.
+fn distances_into(agents: &[f64], goals: &[f64], dims: usize, power: f64, costs: &mut Vec<f64>) {
     costs.clear();
     costs.reserve((agents.len() / dims.max(1)) * (goals.len() / dims.max(1)));
     for agent in agents.chunks_exact(dims.max(1)) {
         if let &[x, y] = agent {
             costs.extend(goals.as_chunks::<2>().0.iter().map(|&[gx, gy]| {
                 let (dx, dy) = (x - gx, y - gy);
-                (dx * dx + dy * dy).sqrt()
+                dx * dx + dy * dy
             }));
         } else {
-            costs.extend(goals.chunks_exact(dims.max(1)).map(|goal| distance(agent, goal)));
+            costs.extend(goals.chunks_exact(dims.max(1)).map(|goal| square(agent, goal)));
         }
+    }
+    if power == 1.0 {
+        costs.iter_mut().for_each(|cost| *cost = cost.sqrt());
+    } else if power != 2.0 {
+        costs.iter_mut().for_each(|cost| *cost = powered_square(*cost, power));
     }
 }
 
@@ -77,38 +79,54 @@ impl Problem {
         self.agent_count * self.place_count()
     }
 
-    /// What stands for the distance of each pair, `[N, G]`: +∞ for forbidden pairs.
-    fn base_into(&self, costs: &mut Vec<f64>) {
+    /// Costs are powers of distances: no words of time, no weights.
+    fn untimed(&self) -> bool {
+        !self.terms.timed() && self.terms.weights.is_empty()
+    }
+
+    /// What stands for the distance of each pair, `[N, G]`, raised to a power: +∞ for forbidden pairs.
+    fn base_into(&self, power: f64, costs: &mut Vec<f64>) {
         match &self.matrix {
             _ if self.only_overrides => {
                 costs.clear();
                 costs.resize(self.agent_count * self.goal_count, f64::INFINITY);
             }
-            Some(matrix) => costs.clone_from(matrix),
-            None => distances_into(&self.agents, &self.goals, self.dims, costs),
+            Some(matrix) => {
+                costs.clone_from(matrix);
+                if power != 1.0 {
+                    costs.iter_mut().for_each(|cost| *cost = powered(*cost, power));
+                }
+            }
+            None => distances_into(&self.agents, &self.goals, self.dims, power, costs),
         }
         for &(agent, goal, cost) in &self.overrides {
-            costs[agent as usize * self.goal_count + goal as usize] = cost;
+            costs[agent as usize * self.goal_count + goal as usize] = powered(cost, power);
         }
         for &(agent, goal) in &self.forbidden {
             costs[agent as usize * self.goal_count + goal as usize] = f64::INFINITY;
         }
     }
 
-    /// What stands for the distance of each agent's pair, `[N]`, whether it is forbidden or not; +∞ without a goal.
-    pub(crate) fn base_of(&self, goal_of: &[u32]) -> Vec<f64> {
+    /// What stands for the distance of each agent's pair, `[N]`, whether it is forbidden or not; +∞ without a goal. `given`: it is
+    /// a cost in place of the distance.
+    fn base_given(&self, goal_of: &[u32]) -> Vec<(f64, bool)> {
         let own = |(agent, &goal): (usize, &u32)| match &self.matrix {
-            _ if goal == UNASSIGNED || self.only_overrides => f64::INFINITY,
-            Some(matrix) => matrix[agent * self.goal_count + goal as usize],
-            None => self.distance(agent, goal as usize),
+            _ if goal == UNASSIGNED || self.only_overrides => (f64::INFINITY, true),
+            Some(matrix) => (matrix[agent * self.goal_count + goal as usize], true),
+            None => (self.distance(agent, goal as usize), false),
         };
-        let mut base: Vec<f64> = goal_of.iter().enumerate().map(own).collect();
+        let mut base: Vec<(f64, bool)> = goal_of.iter().enumerate().map(own).collect();
         for &(agent, goal, cost) in &self.overrides {
             if goal_of[agent as usize] == goal {
-                base[agent as usize] = cost;
+                base[agent as usize] = (cost, true);
             }
         }
         base
+    }
+
+    /// The same without the origin.
+    pub(crate) fn base_of(&self, goal_of: &[u32]) -> Vec<f64> {
+        self.base_given(goal_of).into_iter().map(|(base, _)| base).collect()
     }
 
     /// Costs `[N, S]`, +∞ for impossible pairs. Returns what a place without an agent costs per unit of weight; it is taken off all
@@ -123,11 +141,31 @@ impl Problem {
     }
 
     fn priced_into(&self, costs: &mut Vec<f64>, weighted: bool) -> f64 {
-        self.base_into(costs);
-        let terms = &self.terms;
+        let (terms, untimed) = (&self.terms, self.untimed());
+        self.base_into(if untimed { terms.power } else { 1.0 }, costs);
         if terms.plain() || costs.is_empty() {
             return 0.0;
         }
+        let unserved = if untimed { self.close(costs) } else { self.time_and_weigh(costs, weighted) };
+        if let Some(places) = self.places() {
+            let rows = costs.chunks_exact(self.goal_count);
+            *costs = rows.flat_map(|row| places.iter().map(|&goal| row[goal as usize])).collect();
+        }
+        self.pin(costs);
+        unserved
+    }
+
+    /// Forbids the pairs of goals that are not open.
+    fn close(&self, costs: &mut [f64]) -> f64 {
+        for goal in (0..self.goal_count).filter(|&goal| !self.terms.open(goal)) {
+            costs.iter_mut().skip(goal).step_by(self.goal_count).for_each(|cost| *cost = f64::INFINITY);
+        }
+        0.0
+    }
+
+    /// Makes costs of distances, `[N, G]`.
+    fn time_and_weigh(&self, costs: &mut [f64], weighted: bool) -> f64 {
+        let terms = &self.terms;
         let weighted = weighted && !terms.weights.is_empty();
         let mut longest = 0.0f64;
         for (agent, row) in costs.chunks_exact_mut(self.goal_count).enumerate() {
@@ -137,20 +175,15 @@ impl Problem {
                 longest = if *cost < f64::INFINITY { longest.max(*cost) } else { longest };
             }
         }
-        let unserved = if weighted && terms.weighted() { raised(UNSERVED * longest, terms.power) } else { 0.0 };
+        let unserved = if weighted && terms.weighted() { powered(UNSERVED * longest, terms.power) } else { 0.0 };
         for row in costs.chunks_exact_mut(self.goal_count) {
             for (goal, cost) in row.iter_mut().enumerate().filter(|(_, cost)| **cost < f64::INFINITY) {
-                *cost = raised(*cost, terms.power) - unserved;
+                *cost = powered(*cost, terms.power) - unserved;
                 if weighted {
                     *cost *= terms.weight(goal);
                 }
             }
         }
-        if let Some(places) = self.places() {
-            let rows = costs.chunks_exact(self.goal_count);
-            *costs = rows.flat_map(|row| places.iter().map(|&goal| row[goal as usize])).collect();
-        }
-        self.pin(costs);
         unserved
     }
 
@@ -212,17 +245,33 @@ impl Problem {
 
     /// Cost and arrival of each agent's pair, `[N]`; nothing without a goal.
     pub fn pair_terms(&self, goal_of: &[u32]) -> Vec<PairTerms> {
-        let terms = &self.terms;
-        let of = |(agent, (&goal, base)): (usize, (&u32, f64))| match goal {
+        let (terms, untimed) = (&self.terms, self.untimed());
+        let of = |(agent, (&goal, (base, given))): (usize, (&u32, (f64, bool)))| match goal {
             UNASSIGNED => PairTerms::default(),
+            // As the solvers see it: the square of a distance is not that of its rounded root.
+            _ if untimed && !given => {
+                let square = self.square(agent, goal as usize);
+                PairTerms { cost: powered_square(square, terms.power), arrival: base }
+            }
             _ => {
                 let Visit { arrival, time, .. } = terms.visit(agent, goal as usize, base);
-                let cost = raised(time, terms.power);
+                let cost = powered(time, terms.power);
                 let cost = if terms.weights.is_empty() { cost } else { terms.weight(goal as usize) * cost };
                 PairTerms { cost, arrival }
             }
         };
-        goal_of.iter().zip(self.base_of(goal_of)).enumerate().map(of).collect()
+        goal_of.iter().zip(self.base_given(goal_of)).enumerate().map(of).collect()
+    }
+
+    /// The team for solvers that need no matrix: powers of distances, with (agent, goal, cost) of pairs that cost something else.
+    /// `None` if there is more to say.
+    pub(crate) fn without_matrix(&self) -> Option<Vec<(u32, u32, f64)>> {
+        let terms = &self.terms;
+        let plain = terms.capacities.is_empty() && !terms.forbids() && self.untimed();
+        (plain && self.matrix.is_none() && !self.only_overrides && self.dims > 0).then(|| {
+            let priced = self.overrides.iter().map(|&(agent, goal, cost)| (agent, goal, powered(cost, terms.power)));
+            priced.chain(self.forbidden.iter().map(|&(agent, goal)| (agent, goal, f64::INFINITY))).collect()
+        })
     }
 
     /// Why a pair is impossible; `base` stands for its distance.
@@ -239,7 +288,7 @@ impl Problem {
     /// What stands in the way of every agent, and of every goal, before pins: `None` where a pair is possible.
     pub(crate) fn obstacles(&self) -> [Vec<Option<Obstacle>>; 2] {
         let mut base = Vec::new();
-        self.base_into(&mut base);
+        self.base_into(1.0, &mut base);
         // Told first: it would work at another time.
         let worse = |one: Option<Obstacle>, other: Option<Obstacle>| match (one, other) {
             (None, _) | (_, None) => None,
@@ -267,8 +316,12 @@ impl Problem {
 
     /// Distance of a pair, in the unit of the positions; 0 without positions.
     pub fn distance(&self, agent: usize, goal: usize) -> f64 {
+        self.square(agent, goal).sqrt()
+    }
+
+    fn square(&self, agent: usize, goal: usize) -> f64 {
         let d = self.dims;
         let (a, g) = (self.agents.get(agent * d..(agent + 1) * d), self.goals.get(goal * d..(goal + 1) * d));
-        distance(a.unwrap_or_default(), g.unwrap_or_default())
+        square(a.unwrap_or_default(), g.unwrap_or_default())
     }
 }

@@ -10,7 +10,10 @@ use crate::UNASSIGNED;
 use crate::costs::{Obstacle, PairTerms};
 use crate::problem::Problem;
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, BottleneckSolver, Solver, compensated_sum, greedy, pairs};
+use magex_assign::{
+    AssignError, BottleneckSolver, PointProblem, Solver, Switching, bottleneck_points, compensated_sum, greedy, pairs,
+    solve_points,
+};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use std::cell::RefCell;
@@ -78,43 +81,101 @@ pub fn solve(
     if problem.cells() == 0 {
         return Ok(nothing(problem, kind));
     }
+    if matches!(kind, AssignmentMethod::Exact | AssignmentMethod::Learned | AssignmentMethod::Makespan)
+        && problem.cells() > KEPT_CELLS
+        && let Some(costs) = problem.without_matrix()
+    {
+        return solve_large(problem, kind, &costs, should_continue);
+    }
     with_workspace(problem, |workspace| {
         let (rows, cols) = (problem.agent_count, problem.place_count());
         problem.costs_into(&mut workspace.costs);
-        let sticky = workspace.adjust(problem);
-        let Workspace { solver, makespan, costs, adjusted, unweighted } = workspace;
-        let target: &[f64] = if sticky { adjusted } else { costs };
+        let current = problem.current_places();
+        let switching = Switching { current: &current, cost: problem.switching_cost };
+        let sticky = sticky(problem);
         let (place_of, scheduler) = match kind {
             AssignmentMethod::Exact | AssignmentMethod::Learned => {
-                (solver.solve_allowed(target, rows, cols, should_continue)?.col_of_row, AssignmentMethod::Exact)
+                let Workspace { solver, costs, .. } = workspace;
+                let answer = solver.solve_switching(costs, rows, cols, &switching, should_continue)?;
+                (answer.col_of_row, AssignmentMethod::Exact)
             }
             AssignmentMethod::Makespan if problem.terms.weighted() => {
+                let Workspace { solver, makespan, costs, unweighted, .. } = workspace;
                 problem.unweighted_into(unweighted);
-                if sticky {
-                    favour(unweighted, cols, problem);
+                let first = makespan.solve_switching(unweighted, rows, cols, &switching, should_continue)?;
+                let leaves = |row: usize, col: usize| {
+                    let left = current.get(row).is_some_and(|&own| own != UNASSIGNED && own as usize != col);
+                    if left { problem.switching_cost } else { 0.0 }
+                };
+                let key = |row: usize, col: usize| unweighted[row * cols + col] + leaves(row, col);
+                let largest = first.pairs().map(|(row, col)| key(row, col)).fold(f64::NEG_INFINITY, f64::max);
+                for (place, cost) in costs.iter_mut().enumerate() {
+                    if key(place / cols, place % cols) > largest {
+                        *cost = f64::INFINITY;
+                    }
                 }
-                let largest = largest(
-                    unweighted,
-                    cols,
-                    &makespan.solve_allowed(unweighted, rows, cols, should_continue)?.col_of_row,
-                );
-                let within = |(cost, first): (&f64, &f64)| if *first <= largest { *cost } else { f64::INFINITY };
-                let second: Vec<f64> = target.iter().zip(unweighted.iter()).map(within).collect();
-                (solver.solve_allowed(&second, rows, cols, should_continue)?.col_of_row, kind)
+                (solver.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
             }
             AssignmentMethod::Makespan => {
-                (makespan.solve_allowed(target, rows, cols, should_continue)?.col_of_row, kind)
+                let Workspace { makespan, costs, .. } = workspace;
+                (makespan.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
             }
-            AssignmentMethod::Greedy => (greedy(target, rows, cols, should_continue)?.col_of_row, kind),
+            AssignmentMethod::Greedy => {
+                let adjusted = workspace.adjust(problem);
+                let target = if adjusted { &workspace.adjusted } else { &workspace.costs };
+                (greedy(target, rows, cols, should_continue)?.col_of_row, kind)
+            }
             AssignmentMethod::Random => {
                 let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
+                (random_allowed(&workspace.costs, rows, cols, &mut stream, should_continue)?, kind)
             }
         };
         let proven = scheduler == AssignmentMethod::Exact && !sticky;
         let plan = Plan { goal_of: goals_of(problem, place_of), scheduler, ..Plan::default() };
         workspace.finish(problem, plan, proven, should_continue)
     })
+}
+
+/// Whether agents have current goals.
+fn sticky(problem: &Problem) -> bool {
+    problem.current.iter().any(|&goal| goal != UNASSIGNED)
+}
+
+/// Solves a large team of positions without a matrix. `costs` are pairs that cost something else.
+fn solve_large(
+    problem: &Problem,
+    kind: AssignmentMethod,
+    costs: &[(u32, u32, f64)],
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Plan, AssignError> {
+    let Problem { agents, goals, dims, .. } = problem;
+    let switching = Switching { current: &problem.current, cost: problem.switching_cost };
+    let own = PointProblem { power: problem.terms.power, costs, ..PointProblem::new(agents, goals, *dims) };
+    let with_current = PointProblem { switching, ..own };
+    let (answer, scheduler) = match kind {
+        AssignmentMethod::Makespan => (bottleneck_points(&with_current, should_continue)?, kind),
+        _ => (solve_points(&with_current, should_continue)?, AssignmentMethod::Exact),
+    };
+    let proven = scheduler == AssignmentMethod::Exact && !sticky(problem);
+    let pairs_of = answer.pairs().count();
+    let mut plan = Plan { goal_of: answer.col_of_row, scheduler, ..Plan::default() };
+    plan.pairs = problem.pair_terms(&plan.goal_of);
+    plan.cost = total(&plan.pairs, 0.0);
+    if proven {
+        plan.exact_cost = Some(plan.cost);
+    } else if problem.cells() <= GAP_CELLS {
+        match solve_points(&own, should_continue) {
+            Ok(exact) if exact.pairs().count() == pairs_of => {
+                plan.exact_cost = Some(total(&problem.pair_terms(&exact.col_of_row), 0.0));
+            }
+            Ok(_) | Err(AssignError::Interrupted) => {}
+            Err(other) => return Err(other),
+        }
+    }
+    if problem.forbids() && pairs_of < problem.agent_count.max(problem.goal_count) {
+        plan.obstacles = problem.obstacles();
+    }
+    Ok(plan)
 }
 
 /// The plan of a team without agents or without goals: all others are left over, at no cost, whatever the method.
@@ -192,7 +253,7 @@ impl Workspace {
     /// Fills the adjusted costs if there are current pairs.
     fn adjust(&mut self, problem: &Problem) -> bool {
         let Self { costs, adjusted, .. } = self;
-        if problem.current.iter().all(|&goal| goal == UNASSIGNED) {
+        if !sticky(problem) {
             return false;
         }
         adjusted.clear();
@@ -249,11 +310,6 @@ fn goals_of(problem: &Problem, mut place_of: Vec<u32>) -> Vec<u32> {
         }
     }
     place_of
-}
-
-/// The largest cost of a matching; −∞ of none.
-fn largest(costs: &[f64], cols: usize, col_of_row: &[u32]) -> f64 {
-    pairs(col_of_row).map(|(row, col)| costs[row * cols + col]).fold(f64::NEG_INFINITY, f64::max)
 }
 
 fn total(pairs: &[PairTerms], unserved: f64) -> f64 {

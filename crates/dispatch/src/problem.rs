@@ -1,10 +1,9 @@
 //! Parses and checks a request for one team.
 
-use crate::costs::LARGEST_COORDINATE;
 use crate::terms::{self, Terms};
-use magex_assign::UNASSIGNED;
+use magex_assign::powered;
+use magex_assign::{LARGEST_COORDINATE, UNASSIGNED};
 use magex_core::ids::Mode;
-use magex_core::power::raised;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::{arrays, v1};
@@ -215,7 +214,7 @@ impl Problem {
         let slowest = terms.speeds.iter().copied().fold(1.0, f64::min);
         let time = most(&terms.offsets) + d / slowest + most(&terms.earliest);
         // Goals that are left over count twice the longest time.
-        let cost = raised(2.0 * time, terms.power) * most(&terms.weights).max(1.0);
+        let cost = powered(2.0 * time, terms.power) * most(&terms.weights).max(1.0);
         ConvertError::ensure(cost <= LARGEST_COST, || {
             let problem = format!(
                 "a pair may take {time:e} by distance, speed and offset; raised to {} and weighted that is beyond {LARGEST_COST:e}; \

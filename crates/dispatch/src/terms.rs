@@ -4,7 +4,7 @@
 //! second of waiting counts as half a second of driving, so that of two agents that must wait the nearer one goes. A pair whose
 //! agent comes after `due` is impossible, as is one with a goal that is not open.
 
-use magex_core::power::POWERS;
+use magex_assign::POWERS;
 use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use std::ops::RangeInclusive;

@@ -112,7 +112,7 @@ fn an_agent_that_joins_a_learned_mission_moves_no_other_agent() {
     });
     let changes = swapped.unwrap().assignment.changes;
     assert_eq!(changes.len(), 2);
-    assert!(changes[0].explanation.contains("saves 2.0000, more than the switching cost of 0.5"), "{changes:?}");
+    assert!(changes[0].explanation.contains("fall by 2.0000, more than 2 x the switching cost of 0.5"), "{changes:?}");
 }
 
 #[test]

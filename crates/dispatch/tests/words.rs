@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_core::power::raised;
+use magex_assign::powered;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_dispatch::engine;
 use magex_dispatch::{Limits, Problem, UNASSIGNED, answer};
@@ -154,7 +154,7 @@ impl Formula<'_> {
     /// Pairs, largest time to the power, and summed cost with what is left over; `None` for an impossible plan.
     fn score(&self, goal_of: &[u32], times: &[f64], unserved: f64) -> Option<(usize, f64, f64)> {
         let power = self.team.power.unwrap_or(1.0);
-        let (mut pairs, mut largest, mut sum) = (0, f64::NEG_INFINITY, 0.0);
+        let (mut pairs, mut largest, mut sum) = (0, 0.0f64, 0.0);
         let mut free: Vec<usize> = (0..self.goals).map(|goal| self.capacity(goal).min(self.agents)).collect();
         for (agent, &goal) in goal_of.iter().enumerate() {
             let pin = self.team.pinned.iter().find(|pin| pin.agent_index == agent as u32);
@@ -167,8 +167,8 @@ impl Formula<'_> {
             }
             pairs += 1;
             free[goal as usize] = free[goal as usize].checked_sub(1)?;
-            largest = largest.max(raised(time, power));
-            sum += self.weight(goal as usize) * raised(time, power);
+            largest = largest.max(powered(time, power));
+            sum += self.weight(goal as usize) * powered(time, power);
         }
         // The places of pinned agents are theirs, whether they can come or not.
         for pin in &self.team.pinned {
@@ -204,7 +204,7 @@ fn check(team: &v1::AssignRequest) -> bool {
     let times: Vec<f64> = (0..n * g).map(|cell| formula.time(cell / g, cell % g)).collect();
     let longest = times.iter().copied().filter(|time| *time < f64::INFINITY).fold(0.0, f64::max);
     let differ = team.goal_weights.iter().any(|weight| *weight != team.goal_weights[0]);
-    let unserved = if differ { raised(2.0 * longest, team.power.unwrap_or(1.0)) } else { 0.0 };
+    let unserved = if differ { powered(2.0 * longest, team.power.unwrap_or(1.0)) } else { 0.0 };
     let mut plans = Vec::new();
     every_plan(n, g, &mut Vec::new(), &mut |goal_of| plans.extend(formula.score(goal_of, &times, unserved)));
     let most = plans.iter().map(|(pairs, ..)| *pairs).max().unwrap();

@@ -17,10 +17,9 @@ use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
 use candle_core::Tensor;
 use magex_assign::random::random;
-use magex_assign::{AssignError, BottleneckSolver, Solver, distance, exact_points, greedy};
+use magex_assign::{AssignError, BottleneckSolver, Solver, distance, exact_points, greedy, powered};
 use magex_core::config::{CommanderConfig, CommanderPolicy};
 use magex_core::ids::Mode;
-use magex_core::power::raised;
 use magex_core::rng::{Key, Purpose, Stream};
 use std::sync::Arc;
 
@@ -216,7 +215,7 @@ impl Commander {
 /// Distances `[N, G]`, raised to a power.
 fn powers(team: &Team<'_>, power: f64) -> Vec<f64> {
     let (agents, goals) = (team.agents.chunks_exact(team.dims), team.goals.chunks_exact(team.dims));
-    agents.flat_map(|agent| goals.clone().map(|goal| raised(distance(agent, goal), power))).collect()
+    agents.flat_map(|agent| goals.clone().map(|goal| powered(distance(agent, goal), power))).collect()
 }
 
 /// The goals that greedy assignment by distance gives.

@@ -2,10 +2,9 @@
 
 use super::{Mission, MissionLimits};
 use crate::UNASSIGNED;
-use crate::costs::distance;
 use crate::problem::Problem;
 use crate::terms::{Terms, check_capacities};
-use magex_core::power::raised;
+use magex_assign::{distance, powered};
 use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use std::collections::HashMap;
@@ -158,7 +157,7 @@ impl Costs<'_> {
         let (row, col, base) = self.base(agent, goal)?;
         let terms = &self.team.problem.terms;
         let visit = terms.visit(row, col, base);
-        (!visit.late && terms.open(col)).then(|| terms.weight(col) * raised(visit.time, terms.power))
+        (!visit.late && terms.open(col)).then(|| terms.weight(col) * powered(visit.time, terms.power))
     }
 
     /// Whether the goal waits for another one.

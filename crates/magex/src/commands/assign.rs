@@ -4,7 +4,7 @@ use crate::failure::{unavailable, usage};
 use crate::options::CommonOptions;
 use crate::output::{Table, note};
 use anyhow::Context as _;
-use magex_core::power::POWERS;
+use magex_assign::POWERS;
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
