@@ -1,7 +1,7 @@
 //! Solves a team's problem by every method but the learned one, and checks the answer of the learned one.
 //!
-//! Switching cost: the current pair of an agent is cheaper by s. The exact solution of these costs minimises
-//! (summed cost) + s · (number of agents that leave their pair). Pairs are not exchanged for equally cheap ones, even with s = 0.
+//! Switching cost: exact and makespan minimise (summed cost) + s · (number of agents that leave their pair), then that number: pairs
+//! are not exchanged for equally cheap ones, even with s = 0. For greedy the current pair of an agent is cheaper by s.
 //! The learned method ignores current pairs: of its answer, only changes that save more than their switching costs are applied.
 
 mod sticky;

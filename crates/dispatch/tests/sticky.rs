@@ -185,3 +185,27 @@ proptest! {
         prop_assert!(score(&plan.goal_of) <= score(&kept) + 1e-6, "never worse than keeping everything");
     }
 }
+
+#[test]
+fn break_even_changes_nothing_and_ties_go_to_the_lowest_index() {
+    let makespan = |problem: &Problem| engine::solve(problem, AssignmentMethod::Makespan, &|| true).unwrap().goal_of;
+    let kept = [
+        matrix(1, &[1.0, 2.0], &[(0, 1)], 1.0),
+        matrix(1, &[2.0, 1.0], &[(0, 0)], 1.0),
+        matrix(2, &[0.0, 1.0, 0.0, 3.0], &[(0, 0), (1, 1)], 1.0),
+        matrix(2, &[2.0, 1.0, 1.0, 2.0], &[(0, 0), (1, 1)], 1.0),
+        // The doubles of 0.3 and 0.1 + 0.2 differ, and it is the doubles that count: 0.3 - 0.1 < 0.2.
+        matrix(1, &[0.3, 0.1], &[(0, 0)], 0.2),
+    ];
+    for problem in &kept {
+        assert_eq!(exact(problem), problem.current, "{problem:?}");
+        assert_eq!(makespan(problem), problem.current, "{problem:?}");
+    }
+    for ones in [matrix(2, &[1.0; 4], &[], 0.0), matrix(3, &[1.0; 9], &[], 0.0), matrix(3, &[1.0; 15], &[], 0.0)] {
+        let diagonal: Vec<u32> = (0..ones.agent_count as u32).collect();
+        assert_eq!((exact(&ones), makespan(&ones)), (diagonal.clone(), diagonal));
+    }
+    // A pair of 1e16 that cannot be avoided leaves the others their digits.
+    assert_eq!(exact(&matrix(2, &[1e16, 1e16, 0.9071, 0.9363], &[], 0.0)), [1, 0]);
+    assert_eq!(exact(&matrix(3, &[1e50, 1e50, 1e50, 1.0, 2.0, 9.0, 1.0, 4.0, 3.0], &[], 0.0)), [2, 1, 0]);
+}
