@@ -106,7 +106,7 @@ def with_commander(address):
 
 
 def plot(path, curves):
-    """Share of the tasks that waited at most so long, as an SVG."""
+    """Share of the tasks that waited at most that time, as an SVG."""
     longest = max(times[-1] for _, _, times in curves)
     with open(path, "w", encoding="utf-8") as file:
         file.write('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 360" font-family="sans-serif" font-size="14">')

@@ -2,6 +2,7 @@
 //! mission and reports each changed assignment with its reason.
 
 mod changes;
+mod edits;
 mod members;
 mod team;
 
@@ -9,17 +10,14 @@ use crate::AssignError;
 use crate::answer::Planned;
 use crate::clock::Now;
 use crate::problem::{Problem, pairs, priced_pairs, switching_cost};
-use crate::terms::{self, DURATIONS, ROUTING, TIMES, within};
-use changes::Exchange;
+use crate::terms::{self, DURATIONS, TIMES, within};
+use edits::finished;
 use magex_assign::distance;
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
-use members::{
-    MemberNames, Side, check_id, check_lengths, check_order, check_record, forget, lifetime, merge, most_pairs,
-    sticky_scheduler,
-};
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use members::{MemberNames, check_id, check_lengths, check_order, check_record, lifetime, sticky_scheduler};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use team::Team;
 
 pub use members::FINISHED_KEPT;
@@ -273,138 +271,6 @@ impl Mission {
         })
     }
 
-    /// Forgets members that finished long ago, as if they had been removed.
-    fn forget(&mut self) {
-        let (agents, goals) = (forget(&mut self.assignment.agents), forget(&mut self.assignment.goals));
-        self.forget_pairs(&agents, &goals);
-    }
-
-    /// Drops what is said about members that are no longer there.
-    fn forget_pairs(&mut self, agents: &HashSet<String>, goals: &HashSet<String>) {
-        if agents.is_empty() && goals.is_empty() {
-            return;
-        }
-        let stays = |(agent, goal): &Names| !agents.contains(agent) && !goals.contains(goal);
-        self.forbidden.retain(stays);
-        self.pinned.retain(stays);
-        self.overrides.retain(|names, _| stays(names));
-        for names in self.assignment.goals.iter_mut().filter_map(|goal| goal.after.as_mut()) {
-            names.goal_ids.retain(|id| !goals.contains(id));
-        }
-    }
-
-    fn upsert(
-        &mut self,
-        agents: Vec<v1::Member>,
-        goals: Vec<v1::Member>,
-        overrides: &[v1::PairCost],
-        limits: &MissionLimits,
-    ) -> Result<(), AssignError> {
-        let first = |members: &[v1::Member]| members.iter().map(|member| member.position.len()).find(|&len| len > 0);
-        let a = &mut self.assignment;
-        let dims = first(&a.agents).or(first(&a.goals)).or(first(&agents)).or(first(&goals)).unwrap_or(2);
-        let pairs = || overrides.iter().filter_map(|item| item.pair.as_ref());
-        let priced: [HashSet<String>; 2] =
-            [pairs().map(|pair| pair.agent_id.clone()).collect(), pairs().map(|pair| pair.goal_id.clone()).collect()];
-        merge(Side::Agents, &mut a.agents, agents, dims, &priced[0], limits)?;
-        merge(Side::Goals, &mut a.goals, goals, dims, &priced[1], limits)?;
-        Ok(())
-    }
-
-    fn remove(&mut self, agents: &[String], goals: &[String]) -> Result<Taken, AssignError> {
-        let a = &mut self.assignment;
-        for (field, members, ids) in [("remove_agents", &mut a.agents, agents), ("remove_goals", &mut a.goals, goals)] {
-            let mut left: HashSet<&str> = members.iter().map(|member| member.id.as_str()).collect();
-            if let Some(k) = ids.iter().position(|id| !left.remove(id.as_str())) {
-                return Err(AssignError::invalid(format!("{field}[{k}]"), "no member has this name"));
-            }
-            let ids: HashSet<&str> = ids.iter().map(String::as_str).collect();
-            members.retain(|member| !ids.contains(member.id.as_str()));
-        }
-        let set = |ids: &[String]| ids.iter().cloned().collect::<HashSet<String>>();
-        let taken = Taken { agents: set(agents), goals: set(goals), ..Taken::default() };
-        self.forget_pairs(&taken.agents, &taken.goals);
-        Ok(taken)
-    }
-
-    /// Agents whose goal has been finished have done one more.
-    fn count_loads(&mut self, finished_before: &HashSet<String>) {
-        let a = &mut self.assignment;
-        let now = finished(&a.goals);
-        let done =
-            a.pairs.iter().filter(|pair| now.contains(&pair.goal_id) && !finished_before.contains(&pair.goal_id));
-        let by: HashSet<&str> = done.map(|pair| pair.agent_id.as_str()).collect();
-        for agent in a.agents.iter_mut().filter(|agent| by.contains(agent.id.as_str())) {
-            agent.load = Some((agent.load.unwrap_or(0.0) + 1.0).min(*DURATIONS.end()));
-        }
-    }
-
-    /// Forbids the pairs of agents that give their goals back.
-    fn forfeit(&mut self, agents: &[String]) -> Result<HashSet<String>, AssignError> {
-        let known = |members: &[v1::Member], id: &str| members.iter().any(|member| member.id == id);
-        for (k, id) in agents.iter().enumerate() {
-            let pair = self.assignment.pairs.iter().find(|pair| pair.agent_id == *id);
-            let pair =
-                pair.ok_or_else(|| AssignError::invalid(format!("forfeit[{k}]"), "no agent of this name has a goal"))?;
-            let names = (pair.agent_id.clone(), pair.goal_id.clone());
-            self.pinned.remove(&names);
-            if known(&self.assignment.agents, &names.0) && known(&self.assignment.goals, &names.1) {
-                self.forbidden.insert(names);
-            }
-        }
-        Ok(agents.iter().cloned().collect())
-    }
-
-    /// Pins must not contradict each other, nor forbidden pairs; those of finished members are dropped.
-    fn check_pins(
-        &mut self,
-        [forbid, pin]: [&str; 2],
-        forbidden: &[Names],
-        pins: &[Names],
-    ) -> Result<(), ConvertError> {
-        let place = |list: &[Names], names: &Names, field: &str| {
-            list.iter().position(|own| own == names).map(|k| format!("{field}[{k}]"))
-        };
-        let field = |names: &Names| {
-            place(pins, names, pin).or_else(|| place(forbidden, names, forbid)).unwrap_or_else(|| "pinned".to_owned())
-        };
-        let capacities: HashMap<&str, u32> =
-            self.assignment.goals.iter().map(|goal| (goal.id.as_str(), goal.capacity.unwrap_or(1))).collect();
-        let (mut goal_of, mut taken) = (HashMap::new(), HashMap::new());
-        for names @ (agent, goal) in &self.pinned {
-            let infinite = self.overrides.get(names) == Some(&f64::INFINITY);
-            ConvertError::ensure(!self.forbidden.contains(names) && !infinite, || {
-                (
-                    field(names),
-                    format!("the pair of {agent} and {goal} is pinned and forbidden; leave out one of the two"),
-                )
-            })?;
-            if let Some(other) = goal_of.insert(agent, goal) {
-                let newer = if pins.contains(names) { names.clone() } else { (agent.clone(), other.clone()) };
-                let problem = format!("{agent} is pinned to {other} and to {goal}; {ROUTING}, or unpin the first pair");
-                return Err(ConvertError::new(field(&newer), problem));
-            }
-            let places = taken.entry(goal).or_insert(0u32);
-            *places += 1;
-            let capacity = capacities.get(goal.as_str()).copied().unwrap_or(1);
-            ConvertError::ensure(*places <= capacity, || {
-                (field(names), format!("{places} agents are pinned to {goal}, which takes {capacity}"))
-            })?;
-        }
-        let done: [HashSet<String>; 2] = [finished(&self.assignment.agents), finished(&self.assignment.goals)];
-        self.pinned.retain(|(agent, goal)| !done[0].contains(agent) && !done[1].contains(goal));
-        self.assignment.pinned = self.pinned.iter().map(pair).collect();
-        Ok(())
-    }
-
-    fn check_size(&self, limits: &MissionLimits) -> Result<(), AssignError> {
-        let most = most_pairs(limits);
-        for (field, count) in [("forbidden", self.forbidden.len()), ("cost_overrides", self.overrides.len())] {
-            ConvertError::ensure(count <= most, || (field, format!("{count} pairs exceed the limit of {most}")))?;
-        }
-        Ok(())
-    }
-
     fn plan(
         &mut self,
         taken: &Taken,
@@ -463,84 +329,15 @@ impl Mission {
         self.explain(&before, taken, team.as_ref(), response.switches);
         Ok(())
     }
-
-    /// Fills in the changes against `before`, with their reasons.
-    fn explain(&mut self, before: &[v1::Pair], taken: &Taken, team: Option<&Team>, switches: u32) {
-        let a = &self.assignment;
-        let (agents, goals) = (by_id(&a.agents), by_id(&a.goals));
-        let costs = team.map(|team| team.costs(self));
-        let cost = |agent: &str, goal: &str| costs.as_ref()?.of(agent, goal);
-        let old: BTreeMap<&str, &str> = before.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
-        let new: BTreeMap<&str, &str> = a.pairs.iter().map(|p| (p.agent_id.as_str(), p.goal_id.as_str())).collect();
-        let kept: Option<f64> = old.iter().map(|(agent, goal)| cost(agent, goal)).sum();
-        let same_size = old.len() == new.len() && !old.is_empty();
-        let left_over = |goals: &BTreeMap<&str, &str>| {
-            costs.as_ref().map_or(0.0, |costs| costs.unserved(goals.values(), a.unserved_cost, new.values()))
-        };
-        let saving = kept.filter(|_| same_size).map(|kept| kept + left_over(&old) - a.cost);
-        let all: BTreeSet<&str> = old.keys().chain(new.keys()).copied().collect();
-        let mut changes = Vec::new();
-        for agent in all {
-            let (from, to) = (old.get(agent).copied(), new.get(agent).copied());
-            if from == to {
-                continue;
-            }
-            let state = |members: &HashMap<&str, &v1::Member>, id: &str| members.get(id).map(|member| member.state());
-            let pinned = |goal: &str| self.pinned.iter().any(|(a, g)| (a == agent) != (g == goal));
-            let reason = match (from, state(&agents, agent)) {
-                (None, _) => v1::ChangeReason::Assigned,
-                (_, None) => v1::ChangeReason::AgentRemoved,
-                _ if taken.agents.contains(agent) => v1::ChangeReason::AgentRemoved,
-                (_, Some(v1::MemberState::Failed)) => v1::ChangeReason::AgentFailed,
-                (_, Some(v1::MemberState::Finished)) => v1::ChangeReason::AgentFinished,
-                (Some(goal), _) => match state(&goals, goal) {
-                    None => v1::ChangeReason::GoalRemoved,
-                    _ if taken.goals.contains(goal) => v1::ChangeReason::GoalRemoved,
-                    Some(v1::MemberState::Failed) => v1::ChangeReason::GoalFailed,
-                    Some(v1::MemberState::Finished) => v1::ChangeReason::GoalFinished,
-                    _ if taken.forfeits.contains(agent) => v1::ChangeReason::Forfeited,
-                    _ if self.forbidden.contains(&(agent.to_owned(), goal.to_owned())) => {
-                        v1::ChangeReason::PairForbidden
-                    }
-                    _ if costs.as_ref().is_some_and(|costs| costs.closed(goal)) => v1::ChangeReason::NotOpen,
-                    _ if costs.as_ref().is_some_and(|costs| costs.late(agent, goal)) => v1::ChangeReason::TooLate,
-                    _ if pinned(goal) => v1::ChangeReason::Pinned,
-                    _ if to.is_none() => v1::ChangeReason::Displaced,
-                    _ => v1::ChangeReason::Switched,
-                },
-            };
-            let gain = from.zip(to).and_then(|(from, to)| Some(cost(agent, from)? - cost(agent, to)?));
-            let exchange = Exchange { agent, from, to, saving, switches, switching_cost: a.switching_cost };
-            changes.push(v1::Change {
-                agent_id: agent.to_owned(),
-                from_goal_id: from.unwrap_or_default().to_owned(),
-                to_goal_id: to.unwrap_or_default().to_owned(),
-                reason: reason.into(),
-                gain,
-                explanation: exchange.sentence(reason),
-            });
-        }
-        (self.assignment.changes, self.assignment.saving) = (changes, saving);
-    }
 }
 
 fn pair((agent, goal): &Names) -> v1::PairRef {
     v1::PairRef { agent_id: agent.clone(), goal_id: goal.clone(), ..Default::default() }
 }
 
-/// Names of finished members.
-fn finished(members: &[v1::Member]) -> HashSet<String> {
-    let done = members.iter().filter(|member| member.state() == v1::MemberState::Finished);
-    done.map(|member| member.id.clone()).collect()
-}
-
 /// Agents that goals take together.
 pub fn places(goals: &[v1::Member]) -> usize {
     goals.iter().map(|goal| goal.capacity.unwrap_or(1) as usize).fold(0, usize::saturating_add)
-}
-
-fn by_id(members: &[v1::Member]) -> HashMap<&str, &v1::Member> {
-    members.iter().map(|member| (member.id.as_str(), member)).collect()
 }
 
 /// Members without a partner: inactive ones, and those that the plan left unassigned, with its `reasons`. Without a plan a side is

@@ -1,6 +1,6 @@
 //! The words of a fleet beside distances: what a pair costs, and which pairs are possible.
 //!
-//! A pair costs `weight · time ^ power` with `time = offset + d / speed + wait / 2`. Whoever is there before `earliest` waits; a
+//! A pair costs `weight · time ^ power` with `time = offset + d / speed + wait / 2`. An agent that is there before `earliest` waits; a
 //! second of waiting counts as half a second of driving, so that of two agents that must wait the nearer one goes. A pair whose
 //! agent comes after `due` is impossible, as is one with a goal that is not open.
 

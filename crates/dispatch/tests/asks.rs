@@ -94,7 +94,7 @@ fn vroom_191_the_last_vehicle_counts() {
 
 #[test]
 fn vroom_466_finish_everything_as_soon_as_possible() {
-    // The same end, and below it the least sum of squares: nobody is late for nothing.
+    // The same end, and below it the least sum of squares: no agent is late for nothing.
     let costs = Some(v1::CostMatrix { agents: 2, goals: 2, values: vec![0.0, 6.0, 6.0, 10.0] });
     let answer = ask(v1::AssignRequest { costs, power: Some(2.0), ..Default::default() });
     assert_eq!((chosen(&answer), answer.cost), (vec![(0, 1), (1, 0)], 72.0));

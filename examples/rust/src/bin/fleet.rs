@@ -194,7 +194,7 @@ async fn with_commander(url: &str) -> anyhow::Result<Vec<f64>> {
     Ok(world.waiting_times())
 }
 
-/// Share of the tasks that waited at most so long, as an SVG.
+/// Share of the tasks that waited at most that time, as an SVG.
 fn plot(curves: &[(&str, &str, Vec<f64>)]) -> String {
     let longest = curves.iter().filter_map(|(.., times)| times.last()).copied().fold(1.0, f64::max);
     let mut svg = String::from(
