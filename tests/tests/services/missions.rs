@@ -147,7 +147,7 @@ async fn a_page_is_cut_before_it_is_too_long_to_take() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;
     let long = "x".repeat(60);
-    let agents: Vec<_> = (0..1000).map(|k| member(&format!("{long}{k}"), [k as f32, 0.0])).collect();
+    let agents: Vec<_> = (0..1000).map(|k| member(&format!("{long}{k}"), [f64::from(k), 0.0])).collect();
     let mut expected = Vec::new();
     for k in 0..60 {
         let id = format!("m{k:02}");
@@ -180,7 +180,7 @@ async fn updates_at_the_same_time_lose_nothing() {
         .map(|k| {
             let mut client = client.clone();
             tokio::spawn(async move {
-                update(&mut client, moved("busy", vec![member(&format!("n{k}"), [1.0, k as f32])])).await
+                update(&mut client, moved("busy", vec![member(&format!("n{k}"), [1.0, f64::from(k)])])).await
             })
         })
         .collect();
