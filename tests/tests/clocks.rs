@@ -31,7 +31,7 @@ impl Commander {
     }
 
     async fn create(&mut self, id: &str, seconds: f64) -> v1::Assignment {
-        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], state: 0 };
+        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], ..Default::default() };
         let request = v1::CreateMissionRequest {
             mission_id: id.into(),
             agents: vec![member("a")],

@@ -41,7 +41,7 @@ fn run(name: &str, examples: Vec<Vec<u8>>, count: usize, target: impl Fn(&[u8]))
 }
 
 fn team() -> v1::AssignRequest {
-    let points = |coordinates: &[f32]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
+    let points = |coordinates: &[f64]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
     let pair =
         |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
     v1::AssignRequest {
@@ -70,11 +70,38 @@ fn requests() -> Vec<Vec<u8>> {
         kinds.map(|kind| v1::AssignRequest { scheduler: kind.into(), ..team() }.encode_to_vec()).to_vec();
     let costs = Some(v1::CostMatrix { agents: 2, goals: 3, values: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0] });
     examples.push(v1::AssignRequest { costs, ..Default::default() }.encode_to_vec());
+    examples.push(worded().encode_to_vec());
+    let sparse = v1::SparseCosts {
+        agents: 3,
+        goals: 2,
+        agent_indices: vec![0, 1, 2],
+        goal_indices: vec![0, 1, 1],
+        values: vec![1.0, 2.0, f64::INFINITY],
+    };
+    examples.push(v1::AssignRequest { sparse_costs: Some(sparse), ..Default::default() }.encode_to_vec());
     examples
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+/// A team that says every word.
+fn worded() -> v1::AssignRequest {
+    v1::AssignRequest {
+        power: Some(2.0),
+        agent_speeds: vec![1.0, 2.0, 0.5],
+        agent_offsets: vec![0.0, 3.0, 1.0],
+        agent_loads: vec![1.0, 0.0, 2.0],
+        balance: 0.5,
+        goal_weights: vec![1.0, 2.0, 3.0],
+        goal_capacities: vec![2, 1, 1],
+        goal_earliest: vec![0.0, 4.0, 0.0],
+        goal_due: vec![f64::INFINITY, 40.0, 9.0],
+        precedence: vec![v1::Precedence { goal_id: "z".into(), after_id: "x".into(), ..Default::default() }],
+        pinned: vec![v1::PairRef { agent_id: "c".into(), goal_id: "y".into(), ..Default::default() }],
+        ..team()
+    }
+}
+
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 fn mission() -> v1::CreateMissionRequest {
@@ -101,7 +128,39 @@ fn framed<const BYTES: usize>(messages: &[Vec<u8>]) -> Vec<u8> {
 fn requests_missions_and_their_records() {
     run("assign", requests(), 200_000, dispatch::assign);
     let life = framed::<1>(&[mission().encode_to_vec(), update().encode_to_vec(), update().encode_to_vec()]);
-    run("mission", vec![life], 100_000, dispatch::mission);
+    let pair =
+        |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
+    let worded = v1::CreateMissionRequest {
+        power: Some(1.5),
+        balance: 1.0,
+        time: 5.0,
+        pinned: vec![pair("a", "x")],
+        agents: vec![
+            v1::Member { speed: Some(2.0), busy_until: Some(9.0), load: Some(1.0), ..member("a", 0.0) },
+            member("b", 4.0),
+        ],
+        goals: vec![
+            v1::Member {
+                weight: Some(2.0),
+                capacity: Some(2),
+                earliest: Some(6.0),
+                due: Some(70.0),
+                ..member("x", 1.0)
+            },
+            v1::Member { after: Some(v1::GoalNames { goal_ids: vec!["x".into()] }), ..member("y", 5.0) },
+        ],
+        ..mission()
+    };
+    let later = v1::UpdateMissionRequest {
+        time: Some(8.0),
+        power: Some(2.0),
+        unpin: vec![pair("a", "x")],
+        pin: vec![pair("b", "x")],
+        forfeit: vec!["a".into()],
+        ..update()
+    };
+    let words = framed::<1>(&[worded.encode_to_vec(), later.encode_to_vec(), update().encode_to_vec()]);
+    run("mission", vec![life, words], 100_000, dispatch::mission);
     let limits = magex_dispatch::mission::MissionLimits { members: 16, lifetime_ms: 1000 };
     let planner = |problem: &magex_dispatch::Problem| {
         let plan = magex_dispatch::engine::solve(problem, problem.scheduler, &|| true)?;
@@ -224,7 +283,12 @@ async fn the_whole_commander() {
                         let response = v1::AssignResponse::decode(&answer.into_inner()[..]).unwrap();
                         let problem =
                             magex_dispatch::Problem::read(request, 1, &magex_dispatch::Limits::default()).unwrap();
-                        dispatch::check_matching(&response, problem.agent_count, problem.goal_count);
+                        dispatch::check_matching(
+                            &response,
+                            problem.agent_count,
+                            &problem.terms.capacities,
+                            problem.goal_count,
+                        );
                     }
                 }
                 Err(status) => match status.code() {

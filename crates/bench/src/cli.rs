@@ -1,7 +1,7 @@
 //! The command line: the tables of docs/results.md, measured on this machine.
 
 use crate::report::Report;
-use crate::{assign, cluster, env, goals, messages, runs, soak, tasks, training, update};
+use crate::{assign, cluster, endless, env, goals, messages, powers, runs, soak, tasks, training, update};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use magex::failure;
 use magex::options::CommonOptions;
@@ -50,10 +50,14 @@ enum What {
     Assign(assign::AssignArgs),
     /// Cost of the commander's assignments over the exact ones.
     Commander(goals::CommanderArgs),
+    /// What powers of distances do to a team that moves, with a trained executor.
+    Powers(powers::PowersArgs),
     /// Train the paper's ranking commander alone, on instances of each layout.
     Ranking(goals::RankingArgs),
     /// Services with two actor processes against the same work in one process.
     Distributed(runs::DistributedArgs),
+    /// A mission on disk whose goals never end: memory and time of an update.
+    Endless(endless::EndlessArgs),
     /// Train and evaluate every size, executor and seed.
     Train(training::TrainArgs),
     /// Train and evaluate Push Ball and the drones.
@@ -69,7 +73,7 @@ enum What {
     /// The learner process of `cluster`: only ingests.
     #[command(hide = true)]
     Ingest(cluster::IngestArgs),
-    /// All of these but soak.
+    /// All of these but soak, powers and endless.
     All,
 }
 
@@ -132,7 +136,9 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Update(args) => update::update(args),
         What::Assign(args) => assign::assign(args),
         What::Commander(args) => goals::commander(args),
+        What::Powers(args) => powers::powers(args),
         What::Ranking(args) => goals::ranking(args),
+        What::Endless(args) => endless::endless(args),
         What::Distributed(args) => runs::distributed(args),
         What::Train(args) => training::train(args),
         What::Tasks(args) => tasks::tasks(args),

@@ -23,7 +23,7 @@ const ABOUT: TableDefinition<'_, &str, u64> = TableDefinition::new("about");
 /// Names of the parts of a [`Mark`] there, in its order.
 const MARK: [&str; 4] = ["clock_ms", "boot_ms", "boot", "day_ms"];
 /// Format of the records; a file with another one is rejected.
-const FORMAT: u64 = 2;
+const FORMAT: u64 = 3;
 /// Pause after a failed write before the file is reopened: opening reads all of it.
 pub const PAUSE: Duration = Duration::from_secs(1);
 
@@ -63,6 +63,7 @@ fn other_format(format: &u64) -> String {
     let own = env!("CARGO_PKG_VERSION");
     match format {
         1 => format!("written by magex 0.1.0 (commit 389f705), which reads it; this is magex {own}"),
+        2 => format!("written by magex 0.2.0 (commit 3cfb71e or before), which reads it; this is magex {own}"),
         other => format!("its format is {other}; this is magex {own}, which reads format {FORMAT}"),
     }
 }

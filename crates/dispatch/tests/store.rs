@@ -24,8 +24,8 @@ fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 fn make(id: &str, owner: &str) -> Mission {
@@ -58,7 +58,7 @@ fn one_owner_leaves_room_for_others() {
     let text = full(missions.insert(make("3", "me")));
     assert!(text.contains(&format!("one client may take {} bytes", 2 * one)), "{text}");
     // A mission does not grow beyond what it could have been made with, either.
-    let more: Vec<_> = (0..50).map(|k| member(&format!("more{k}"), k as f32)).collect();
+    let more: Vec<_> = (0..50).map(|k| member(&format!("more{k}"), k as f64)).collect();
     let larger = update(&second, v1::UpdateMissionRequest { agents: more, ..Default::default() });
     assert!(full(missions.replace(larger, 1)).contains("one client"));
     missions.insert(make("3", "you")).unwrap();
@@ -361,13 +361,13 @@ fn a_real_disk_that_was_full_is_used_again() {
 fn a_file_of_an_older_format_is_rejected_with_the_version_that_reads_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("missions.redb");
-    {
+    for (format, version) in [(1, "0.1.0 (commit 389f705)"), (2, "0.2.0 (commit 3cfb71e or before)")] {
         let about = redb::TableDefinition::<&str, u64>::new("about");
         let write = Database::create(&path).unwrap().begin_write().unwrap();
-        write.open_table(about).unwrap().insert("format", 1).unwrap();
+        write.open_table(about).unwrap().insert("format", format).unwrap();
         write.commit().unwrap();
+        let error = Disk::open(&path).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("written by magex {version}, which reads it; this is magex ")), "{error}");
+        assert!(error.ends_with("--data folder"), "{error}");
     }
-    let error = Disk::open(&path).unwrap_err().to_string();
-    assert!(error.starts_with("written by magex 0.1.0 (commit 389f705), which reads it; this is magex "), "{error}");
-    assert!(error.ends_with("--data folder"), "{error}");
 }

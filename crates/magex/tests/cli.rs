@@ -291,7 +291,7 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("eval run --seeds 1,2", 64, &["--seeds", "--episode-seeds"]),
         ("bench env --json", 64, &["cargo run --release -p magex-bench -- env --json"]),
         ("eval run --episodes 0", 64, &["--episodes"]),
-        ("eval run --scheduler ranking", 64, &["use pairwise, exact, greedy or random"]),
+        ("eval run --scheduler ranking", 64, &["use pairwise, exact, makespan, greedy or random"]),
         ("eval run --per-layout", 64, &["--spawn lines"]),
         ("eval run --controller fastest", 64, &["fastest", "astar", "orca"]),
         ("eval run --scheduler nearest", 64, &["nearest", "greedy"]),
