@@ -124,7 +124,7 @@ impl RolloutPool {
         self.threads.len().saturating_sub(self.busy)
     }
 
-    /// The number of a thread that has not moved for so many calls although it has a shard.
+    /// The number of a thread that has not moved for this number of calls although it has a shard.
     pub(crate) fn stuck(&mut self, calls: u32) -> Option<usize> {
         self.watch.stuck(calls)
     }

@@ -17,7 +17,7 @@ use tonic::{Status, Streaming};
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 const LONGEST_LEASE: Duration = Duration::from_secs(3600);
 
-/// A rollout thread that has a shard and has not moved for so many leases hangs. Each of its waits (for weights, for goals) ends after
+/// A rollout thread that has a shard and has not moved for this number of leases hangs. Each of its waits (for weights, for goals) ends after
 /// one.
 const STUCK_LEASES: u32 = 8;
 /// Heartbeats per lease.

@@ -1,43 +1,12 @@
 //! The trainer's view of the actors: it publishes weights and collects the results of plans.
 
+use crate::origin::Origin;
 use crate::report::bottleneck::CollectTiming;
 use crate::run_events::{CollectError, StopReason};
 use magex_core::ids::Shard;
-use magex_core::sha256;
 use magex_core::trajectory::ShardResult;
 use magex_proto::weights::Weights;
 use std::sync::Arc;
-
-/// Where a result comes from.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Origin {
-    /// Name of the actor, for people.
-    pub actor: Arc<str>,
-    /// Id of the actor's process.
-    pub process: u64,
-    /// SHA-256 (hex) of the encoded result.
-    pub digest: String,
-}
-
-impl Origin {
-    /// The digest of an encoded result.
-    pub fn digest_of(encoded: &[u8]) -> String {
-        sha256::hex(encoded)
-    }
-}
-
-/// An actor is proven to have sent a wrong result: what it computed before cannot be relied on.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Conviction {
-    /// The sender, and the digest of its wrong result.
-    pub origin: Origin,
-    /// The shard of that result.
-    pub shard: Shard,
-    /// SHA-256 (hex) of the right result.
-    pub digest: String,
-    /// First iteration that trained on results of this sender which no second computation has confirmed, if there is one.
-    pub since: Option<u32>,
-}
 
 /// Collects the results of plans. Called from the training thread, which it blocks.
 pub trait Collector: Send {
@@ -62,10 +31,10 @@ pub trait Collector: Send {
         Ok(())
     }
 
-    /// The result of this origin cannot be trained on: counts it as rejected and sends its actor away.
+    /// The result of this origin cannot be trained on: counts it as rejected and evicts its actor.
     fn reject(&mut self, _origin: &Origin, _reason: &str) {}
 
-    /// The run went back to a checkpoint of so many iterations: what came after it did not happen.
+    /// The run went back to a checkpoint of this number of iterations: what came after it did not happen.
     fn went_back(&mut self, _iteration: u32) {}
 
     /// The first iteration that may still turn out to have trained on a wrong result.

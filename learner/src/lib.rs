@@ -18,6 +18,7 @@ pub mod cli;
 pub mod collector;
 #[cfg(test)]
 mod fixtures;
+pub mod origin;
 pub mod report;
 pub mod run_events;
 pub mod run_folder;

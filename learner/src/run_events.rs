@@ -1,6 +1,6 @@
 //! Events of a run, and the reasons for which collecting or training ends.
 
-use crate::collector::Conviction;
+use crate::origin::Conviction;
 use magex_core::ids::{RunId, Shard, WeightsVersion};
 use magex_nets::params::ParamError;
 use magex_proto::v1;

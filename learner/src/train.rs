@@ -12,3 +12,4 @@ pub mod qmix;
 pub mod replay;
 pub mod rmsprop;
 pub mod stats;
+pub mod suspect;

@@ -95,11 +95,11 @@ fn recomputing(share: &str) -> Setup {
     Setup { environment: vec![("MAGEX_RECOMPUTE".to_owned(), PathBuf::from(share))], ..Setup::default() }
 }
 
-/// Runs with an actor that spoils its results, alone until it is sent away, and then with an honest one.
+/// Runs with an actor that spoils its results, alone until it is evicted, and then with an honest one.
 fn survives(config: &RunConfig, what: &str, spoil: Spoil, said: &str, recompute: &str) {
     let mut cluster = Cluster::start_with(config, recomputing(recompute));
     let bad = Played::start(&cluster, cluster.commander_address(), "spoiler", Duration::ZERO, spoil);
-    let error = bad.end().expect_err("it is sent away").to_string();
+    let error = bad.end().expect_err("it is evicted").to_string();
     assert!(error.contains("evicted this actor") && error.contains(said), "{what}: {error}");
     cluster.start_actor();
     assert_eq!(cluster.finish(), undisturbed(config), "{what}");

@@ -1,6 +1,6 @@
 //! Observers of a run: metrics.jsonl, TensorBoard, the live page, Prometheus and event streams follow one interface.
 
-use crate::collector::Origin;
+use crate::origin::Origin;
 use crate::report::records::IterationMetrics;
 use crate::run_events::RunEvent;
 use magex_core::ids::{RunId, Shard};
@@ -58,7 +58,7 @@ pub trait RunObserver: Debug + Send {
     /// An iteration is going to be trained on these results of actors.
     fn senders(&mut self, _iteration: u32, _results: &[(Shard, Origin)]) {}
 
-    /// The run went back to a checkpoint of `iteration` iterations and so many joint steps: what is later did not happen.
+    /// The run went back to a checkpoint of `iteration` iterations and this number of joint steps: what is later did not happen.
     ///
     /// # Errors
     /// A file cannot be cut back.

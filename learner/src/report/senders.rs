@@ -1,7 +1,7 @@
 //! senders.jsonl: which actor computed which shard that was trained on, one line per iteration. If an actor turns out to compute
 //! wrong results, it tells what they are in. No number of the run depends on it.
 
-use crate::collector::Origin;
+use crate::origin::Origin;
 use crate::report::observer::{FileError, RunObserver};
 use magex_core::ids::{Shard, ShardKind};
 use serde::Serialize;

@@ -1,6 +1,7 @@
 //! The collector whose actors connect over gRPC.
 
-use crate::collector::{Collector, Origin};
+use crate::collector::Collector;
+use crate::origin::Origin;
 use crate::report::bottleneck::CollectTiming;
 use crate::run_events::{CollectError, StopReason};
 use crate::serve::judge::{Compute, Judge};
@@ -23,7 +24,7 @@ pub struct GrpcCollector {
     /// Of the last plan that was collected.
     pub(crate) shards: Vec<Shard>,
     pub(crate) origins: Vec<Origin>,
-    /// First iteration that trained on results of a process which no second computation has confirmed. A result that is
+    /// First iteration that trained on results of a process which no second computation has confirmed. A training result that is
     /// confirmed vouches for all that its process sent before.
     pub(crate) unconfirmed: BTreeMap<u64, u32>,
 }
@@ -70,12 +71,13 @@ impl GrpcCollector {
 
     /// Notes what was confirmed, and what trains now and is not.
     fn note(&mut self) {
-        let (confirmed, checked): (Vec<(u64, u32)>, Vec<u64>) = self
+        let (confirmed, checked): (Vec<(u64, Shard)>, Vec<u64>) = self
             .shared
             .work
             .with_ledger(|ledger| (ledger.checks.take_confirmed(), ledger.checks.processes().collect()));
-        for (process, iteration) in confirmed {
-            self.unconfirmed.entry(process).and_modify(|since| *since = iteration.max(*since));
+        // An actor may evaluate well and train badly: evaluations vouch for nothing.
+        for (process, shard) in confirmed.into_iter().filter(|(_, shard)| shard.kind == ShardKind::Train) {
+            self.unconfirmed.entry(process).and_modify(|since| *since = shard.iteration.0.max(*since));
         }
         let connected = self.shared.roster.connected_processes();
         // A process that is gone and has nothing to be checked cannot be convicted any more.
@@ -132,7 +134,7 @@ impl Collector for GrpcCollector {
     }
 
     fn reject(&mut self, origin: &Origin, reason: &str) {
-        self.shared.send_away(origin.process, reason, Rejection::Update);
+        self.shared.evict_now(origin.process, reason, Rejection::Update);
     }
 
     fn went_back(&mut self, iteration: u32) {

@@ -1,6 +1,6 @@
 //! The learner's own host computes a shard, if there is no other way to find out which result of it is right.
 
-use crate::collector::Origin;
+use crate::origin::Origin;
 use magex_core::ids::{RunId, Shard};
 use magex_core::trajectory::ShardResult;
 use magex_proto::convert::encode_result;

@@ -17,7 +17,7 @@ use self::checks::{Checks, Sampling};
 use self::pace::Pace;
 pub(crate) use self::totals::Counters;
 use self::totals::{DUPLICATE, EXPIRED, FAILED, REJECTED, TRAINED, Totals, balanced};
-use crate::collector::Origin;
+use crate::origin::Origin;
 use crate::run_events::CollectError;
 use magex_core::error::FieldError;
 use magex_core::ids::{Shard, ShardKind};

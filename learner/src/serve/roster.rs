@@ -28,8 +28,8 @@ pub(crate) struct ActorEntry {
     pub(crate) last_seen: Instant,
     /// Ends the session: the same process has connected again.
     pub(crate) replaced: CancellationToken,
-    /// Ends the session with this reason: the actor is sent away.
-    pub(crate) sent_away: watch::Sender<Option<String>>,
+    /// Ends the session with this reason: the actor is evicted.
+    pub(crate) eviction: watch::Sender<Option<String>>,
     /// Whether it would take another lease.
     pub(crate) has_room: bool,
     /// Leases given back in a row.
@@ -135,11 +135,11 @@ impl Roster {
     }
 
     /// [`Self::evict`], and ends the process's session if it has one.
-    pub(crate) fn send_away(&self, process_id: u64, reason: &str) {
+    pub(crate) fn evict_now(&self, process_id: u64, reason: &str) {
         let mut members = self.members.lock();
         members.evict(process_id);
         for actor in members.connected.values().filter(|actor| actor.process_id == process_id) {
-            actor.sent_away.send_replace(Some(reason.to_owned()));
+            actor.eviction.send_replace(Some(reason.to_owned()));
         }
     }
 

@@ -126,8 +126,8 @@ fn handshake(
             hello.task_fingerprint
         )));
     }
-    let (replaced, sent_away) = (CancellationToken::new(), watch::Sender::new(None));
-    let signals = Signals { replaced: replaced.clone(), sent_away: sent_away.subscribe() };
+    let (replaced, eviction) = (CancellationToken::new(), watch::Sender::new(None));
+    let signals = Signals { replaced: replaced.clone(), eviction: eviction.subscribe() };
     let id = shared.roster.join(ActorEntry {
         status: v1::ActorStatus {
             actor_id: hello.actor_id.clone(),
@@ -138,7 +138,7 @@ fn handshake(
         process_id: hello.process_id,
         last_seen: Instant::now(),
         replaced,
-        sent_away,
+        eviction,
         has_room: false,
         hand_backs: 0,
         outbound: outbound.downgrade(),
@@ -151,8 +151,8 @@ fn handshake(
 struct Signals {
     /// Another session of the process replaces this one.
     replaced: CancellationToken,
-    /// The actor is sent away, for this reason.
-    sent_away: watch::Receiver<Option<String>>,
+    /// The actor is evicted, for this reason.
+    eviction: watch::Receiver<Option<String>>,
 }
 
 struct GrantedLease {
@@ -253,7 +253,7 @@ impl Session {
     {
         let wakeups = self.shared.work.lease_wakeups();
         let (closing, complete) = (self.shared.control.closing.clone(), self.shared.control.complete.clone());
-        let (Signals { replaced, mut sent_away }, outbound) = (self.signals.clone(), self.outbound.clone());
+        let (Signals { replaced, mut eviction }, outbound) = (self.signals.clone(), self.outbound.clone());
         if let Err(end) = self.send(self.welcome()).await {
             return end;
         }
@@ -272,7 +272,7 @@ impl Session {
                 () = closing.cancelled() => return SessionEnd::Closing,
                 () = complete.cancelled() => return SessionEnd::Closing,
                 () = replaced.cancelled() => return SessionEnd::Replaced,
-                reason = reason_of(&mut sent_away) => {
+                reason = reason_of(&mut eviction) => {
                     return SessionEnd::Refused(status::invalid_argument("result", reason));
                 }
                 message = inbound.next() => {
@@ -401,9 +401,9 @@ impl Session {
     }
 }
 
-/// Why the actor is sent away, once it is.
-async fn reason_of(sent_away: &mut watch::Receiver<Option<String>>) -> String {
-    let reason = sent_away.wait_for(Option::is_some).await.ok().and_then(|reason| reason.clone());
+/// Why the actor is evicted, once it is.
+async fn reason_of(eviction: &mut watch::Receiver<Option<String>>) -> String {
+    let reason = eviction.wait_for(Option::is_some).await.ok().and_then(|reason| reason.clone());
     match reason {
         Some(reason) => reason,
         // The roster has forgotten the session, which ends by itself.

@@ -14,7 +14,7 @@
 //! Two changes end the training thread's wait although they are not in the ledger: the last actor leaves, and a stop is
 //! requested. Both happen within [`Work::wake_after`], under the work lock.
 
-use crate::collector::Conviction;
+use crate::origin::Conviction;
 use crate::run_events::{CollectError, StopReason, describe};
 use crate::run_identity::RunIdentity;
 use crate::serve::control::Control;
@@ -110,10 +110,10 @@ impl Shared {
         self.work.wait_for_checks(&mut TrainingThread { shared: self, judge })
     }
 
-    /// Sends an actor away for good and discards what it computed.
-    pub(crate) fn send_away(&self, process: u64, reason: &str, why: Rejection) {
+    /// Evicts an actor and discards what it computed.
+    pub(crate) fn evict_now(&self, process: u64, reason: &str, why: Rejection) {
         self.metrics.rejected(why);
-        self.roster.send_away(process, reason);
+        self.roster.evict_now(process, reason);
         self.work.with_ledger(|ledger| ledger.checks.forget(process));
     }
 
@@ -169,10 +169,8 @@ impl Shared {
         for (session, actor) in self.roster.sessions() {
             let name = [actor.status.actor_id.as_str()];
             let oldest = self.work.inspect(|ledger| ledger.oldest_of(session));
-            if let Some(oldest) = oldest {
-                let age = now.saturating_duration_since(oldest.since).as_secs_f64();
-                self.metrics.oldest_lease.with_label_values(&name).set(age);
-            }
+            let age = oldest.map_or(0.0, |oldest| now.saturating_duration_since(oldest.since).as_secs_f64());
+            self.metrics.oldest_lease.with_label_values(&name).set(age);
             self.metrics.hand_backs.with_label_values(&name).set(actor.hand_backs.into());
         }
         let waiting = !self.status.finished();
@@ -275,9 +273,9 @@ impl Waiting for TrainingThread<'_> {
                 shard = describe(shard),
                 sent = origin.digest,
                 right = digest.as_deref(),
-                "an actor computes wrong results; it is sent away, and what it computed is discarded"
+                "an actor computes wrong results; it is evicted, and what it computed is discarded"
             );
-            self.shared.send_away(origin.process, &reason, Rejection::Recomputed);
+            self.shared.evict_now(origin.process, &reason, Rejection::Recomputed);
             let digest = digest.clone().unwrap_or_default();
             conviction.get_or_insert_with(|| Box::new(Conviction { origin, shard: *shard, digest, since: None }));
         }

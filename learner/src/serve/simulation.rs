@@ -334,7 +334,7 @@ fn play(seed: u64, product: Product, troubles: Troubles) -> (u32, u64) {
     })
 }
 
-/// A time below so many milliseconds.
+/// A time below this number of milliseconds.
 fn up_to(random: &mut Stream, milliseconds: u32) -> Duration {
     Duration::from_millis(random.below(milliseconds).into())
 }

@@ -1,7 +1,7 @@
 //! The work of the open plan: the ledger, its timing and trace, and the two sides that wait for it: sessions for shards to
 //! lease, the training thread for the results.
 
-use crate::collector::{Conviction, Origin};
+use crate::origin::{Conviction, Origin};
 use crate::report::bottleneck::CollectTiming;
 use crate::report::shard_timing::ShardTiming;
 use crate::run_events::{CollectError, StopReason};
@@ -46,7 +46,7 @@ pub(crate) trait Waiting {
     /// The processes of the connected actors.
     fn connected(&self) -> Vec<u64>;
 
-    /// Computes a shard on this host and closes its check; an actor whose result differs is sent away.
+    /// Computes a shard on this host and closes its check; an actor whose result differs is evicted.
     fn decide(&mut self, check: &Check) -> Result<Option<Box<Conviction>>, CollectError>;
 }
 

@@ -8,10 +8,10 @@ mod imitation;
 #[cfg(test)]
 mod tests;
 
-use crate::train::algorithm::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use crate::train::batch::column;
 use crate::train::learned::{Learned, Network};
 use crate::train::mappo::clipped_surrogate;
+use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Tensor, Var};
 use magex_core::config::CommanderConfig;
 use magex_core::joint_state::group_positions;

@@ -18,11 +18,11 @@
 //! | 13 | log-probabilities that the first minibatch (with memories: every chunk) does not reproduce refuse the batch before anything is changed | ours |
 //! | 14 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
-use crate::train::algorithm::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use crate::train::batch::{Batch, Slice, column, sum_of_rows};
 use crate::train::gae::{Gae, ValueNorm};
 use crate::train::learned::{Learned, Network};
 use crate::train::stats::UpdateStats;
+use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Result as CandleResult, Tensor, Var};
 use magex_core::config::RunConfig;
 use magex_core::rng::{Key, Purpose};

@@ -4,7 +4,7 @@ use crate::checkpoint::CheckpointError;
 use crate::report::observer::FileError;
 use crate::report::records::Summary;
 use crate::run_events::{CollectError, StopReason};
-use crate::train::algorithm::UpdateError;
+use crate::train::suspect::UpdateError;
 use magex_core::config::ConfigError;
 use magex_nets::commander::CommanderError;
 use magex_nets::params::ParamError;

@@ -3,13 +3,14 @@
 
 use super::{TrainError, Trainer};
 use crate::checkpoint;
-use crate::collector::{Collector, Conviction, Origin};
+use crate::collector::Collector;
+use crate::origin::{Conviction, Origin};
 use crate::report::observer::FileError;
 use crate::report::records::Timing;
 use crate::run_events::{CollectError, RunEvent, StopReason, describe};
-use crate::train::algorithm::UpdateError;
 use crate::train::commander_ppo::CommanderStats;
 use crate::train::stats::UpdateStats;
+use crate::train::suspect::UpdateError;
 use magex_core::ids::Shard;
 use magex_core::trajectory::{ShardResult, Trajectory};
 use magex_proto::convert::encode_result;
@@ -97,7 +98,7 @@ impl Trainer {
         self.observers.iter_mut().try_for_each(|observer| observer.went_back(iteration, joint_env_steps))
     }
 
-    /// Updates, or finds the results that made the update fail: these are kept aside and their actors sent away, and the update
+    /// Updates, or finds the results that made the update fail: these are kept aside and their actors evicted, and the update
     /// has changed nothing (`None`).
     pub(super) fn update_or_refuse(
         &mut self,
@@ -154,7 +155,7 @@ impl Trainer {
             process = origin.process,
             shard,
             reason,
-            "a result cannot be trained on; it is kept in quarantine, its actor is sent away, and the shard is computed again"
+            "a result cannot be trained on; it is kept in quarantine, its actor is evicted, and the shard is computed again"
         );
         let folder = self.place.folder().join(QUARANTINE);
         let name = format!(

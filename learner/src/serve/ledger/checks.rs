@@ -5,7 +5,7 @@
 //! for it.
 
 use super::{Asker, LeaseId};
-use crate::collector::Origin;
+use crate::origin::Origin;
 use magex_core::ids::Shard;
 use magex_core::rng::{Key, Purpose};
 use std::collections::HashMap;
@@ -62,8 +62,8 @@ pub(crate) struct Checks {
     sampling: Sampling,
     /// Results accepted from each process.
     standing: HashMap<u64, u32>,
-    /// Processes of results that were confirmed, and the iterations of their shards, since the last look.
-    confirmed: Vec<(u64, u32)>,
+    /// Processes of results that were confirmed, and their shards, since the last look.
+    confirmed: Vec<(u64, Shard)>,
     pub(crate) totals: CheckTotals,
 }
 
@@ -135,7 +135,7 @@ impl Checks {
                 self.open.remove(at);
                 self.totals.same += 1;
             }
-            self.confirmed.push((first.process, shard.iteration.0));
+            self.confirmed.push((first.process, *shard));
         }
         false
     }
@@ -167,12 +167,12 @@ impl Checks {
         let of_two = [Some(check.first), check.second];
         let (right, wrong): (Vec<Origin>, Vec<Origin>) =
             of_two.into_iter().flatten().partition(|origin| origin.digest == digest);
-        self.confirmed.extend(right.iter().map(|origin| (origin.process, shard.iteration.0)));
+        self.confirmed.extend(right.iter().map(|origin| (origin.process, *shard)));
         *(if wrong.is_empty() { &mut self.totals.same } else { &mut self.totals.different }) += 1;
         wrong
     }
 
-    /// Forgets what a process that was sent away computed: its results are discarded.
+    /// Forgets what a process that was evicted computed: its results are discarded.
     pub(crate) fn forget(&mut self, process: u64) {
         self.open.retain(|check| check.first.process != process);
         for check in &mut self.open {
@@ -199,7 +199,7 @@ impl Checks {
         self.open.clear();
     }
 
-    pub(crate) fn take_confirmed(&mut self) -> Vec<(u64, u32)> {
+    pub(crate) fn take_confirmed(&mut self) -> Vec<(u64, Shard)> {
         std::mem::take(&mut self.confirmed)
     }
 }

@@ -340,7 +340,7 @@ fn a_newcomers_result_is_computed_again_by_another_and_the_plan_does_not_wait_fo
     ledger.complete(B, next.id, result(next.shard), sent(B, "y")).unwrap();
     assert!(ledger.all_done() && ledger.take().is_none());
     assert_eq!(ledger.complete(B, check.id, result(check.shard), sent(B, "x")), Ok(Verdict::Duplicate));
-    assert_eq!(ledger.checks.take_confirmed(), [(A.0, 0)]);
+    assert_eq!(ledger.checks.take_confirmed(), [(A.0, lease.shard)]);
     assert!(ledger.take().is_some());
     assert_eq!((ledger.counters().residual, ledger.checks.totals.same), (0, 1));
 }
@@ -359,7 +359,7 @@ fn results_that_differ_are_a_case_for_the_learners_host() {
     let case = ledger.checks.case(&[A.0, B.0], |_| None, now).unwrap();
     let wrong = ledger.checks.decide(&case.shard, Some("right"));
     assert_eq!(wrong.iter().map(|origin| origin.process).collect::<Vec<_>>(), [A.0]);
-    assert_eq!(ledger.checks.take_confirmed(), [(B.0, 0)]);
+    assert_eq!(ledger.checks.take_confirmed(), [(B.0, lease.shard)]);
 }
 
 #[test]

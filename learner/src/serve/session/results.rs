@@ -1,7 +1,7 @@
 //! The end of a lease: its result arrives, or the actor returns it without one.
 
 use super::{PROBE, Session, SessionEnd};
-use crate::collector::Origin;
+use crate::origin::Origin;
 use crate::run_events::describe;
 use crate::serve::ledger::{LeaseId, MAX_FAILURES, ShardFailure};
 use crate::serve::metrics::{Rejection, steps_of};

@@ -88,7 +88,7 @@ pub(super) async fn run(world: Rc<World>, number: usize) {
     }
 }
 
-/// One process, until it dies; whether it was sent away.
+/// One process, until it dies; whether it was evicted.
 async fn live(world: &Rc<World>, number: usize, process: u64, random: &mut Stream) -> bool {
     let own = &world.actors[number];
     let threads = 1 + random.below(2) as usize;
@@ -146,7 +146,7 @@ async fn live(world: &Rc<World>, number: usize, process: u64, random: &mut Strea
             if let Some(status) = ended {
                 use tonic::Code::{FailedPrecondition, InvalidArgument};
                 if matches!(status.code(), InvalidArgument | FailedPrecondition) {
-                    assert!(world.liars.borrow().contains(&process), "seed {}: sent away: {status}", world.seed);
+                    assert!(world.liars.borrow().contains(&process), "seed {}: evicted: {status}", world.seed);
                     return true;
                 }
                 break;
