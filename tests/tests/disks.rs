@@ -125,7 +125,7 @@ impl Commander {
     }
 
     async fn create(&mut self, id: String) {
-        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], state: 0 };
+        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], ..Default::default() };
         let (agents, goals) = (vec![member("a")], vec![member("g")]);
         let request = v1::CreateMissionRequest { mission_id: id, agents, goals, ..Default::default() };
         self.client.create_mission(request).await.unwrap();

@@ -366,14 +366,20 @@ fn nearly_tight(costs: &[f64], price: &[f64], limit: f64, near: &mut Vec<u32>) -
     let mut least = [f64::INFINITY; LANES];
     let chunks = costs.as_chunks::<LANES>().0.iter().zip(price.as_chunks::<LANES>().0);
     for (chunk, (costs, price)) in chunks.enumerate() {
-        let mut hit = [false; LANES];
+        let mut hits = 0u8;
         for lane in 0..LANES {
             let reduced = costs[lane] - price[lane];
             least[lane] = lower(reduced, least[lane]);
-            hit[lane] = reduced <= limit;
+            hits |= u8::from(reduced <= limit) << lane;
         }
-        if hit.iter().fold(false, |any, &hit| any | hit) {
-            near.extend((0..LANES).filter(|&lane| hit[lane]).map(|lane| (chunk * LANES + lane) as u32));
+        let first = (chunk * LANES) as u32;
+        if hits == u8::MAX {
+            near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
+        } else {
+            while hits != 0 {
+                near.push(first + hits.trailing_zeros());
+                hits &= hits - 1;
+            }
         }
     }
     least.into_iter().fold(f64::INFINITY, lower)

@@ -23,7 +23,7 @@
 //! Costs are the doubles that are given, and their sums are compared as if they were added without rounding: 0.1 + 0.2 is more
 //! than 0.3, because these doubles are. Whoever wants sums of decimals to tie gives whole numbers, for example cents. Neither the
 //! range of the costs nor the size of the problem matters, so a pair of 10^50 that cannot be avoided leaves the others exact.
-//! There is one answer to every problem, the same from every solver of this crate.
+//! There is one answer to every problem, the same from every solver of this crate; [`solve_points`] names the only exception.
 
 #![allow(
     clippy::needless_range_loop,

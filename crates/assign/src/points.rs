@@ -19,6 +19,7 @@ fn square<T: Copy + Into<f64>>(a: &[T], b: &[T]) -> f64 {
 
 /// value^power for value ≥ 0. 1, 1.5 and 2 are square roots and products; every other power is libm's, the same bits on every
 /// machine.
+#[inline]
 pub fn powered(value: f64, power: f64) -> f64 {
     if power == 1.0 {
         value
@@ -33,6 +34,7 @@ pub fn powered(value: f64, power: f64) -> f64 {
 
 /// The cost distance^power of a pair whose squared distance is `square`. For the power 2 this is `square` itself, without the
 /// rounding of a root.
+#[inline]
 pub fn powered_square(square: f64, power: f64) -> f64 {
     if power == 2.0 { square } else { powered(square.sqrt(), power) }
 }

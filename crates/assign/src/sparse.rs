@@ -8,6 +8,7 @@
 
 mod auction;
 mod candidates;
+mod costs;
 mod pairs;
 mod points;
 mod search;

@@ -60,7 +60,7 @@ fn timed<T>(message: T) -> Request<T> {
 }
 
 fn member(id: &str, content: u32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![if content % 2 == 0 { 1.0 } else { 2.0 }, 0.0], state: 0 }
+    v1::Member { id: id.into(), position: vec![if content % 2 == 0 { 1.0 } else { 2.0 }, 0.0], ..Default::default() }
 }
 
 /// The content is the name of the goal: any type of positions will do.

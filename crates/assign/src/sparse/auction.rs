@@ -34,7 +34,8 @@ impl<C: Candidates> Engine<C> {
         let mut sum = 0.0;
         for row in 0..rows as u32 {
             let best = self.best(row);
-            sum += best.second - best.least;
+            // A row may have only one column.
+            sum += if best.second < f64::INFINITY { best.second - best.least } else { 0.0 };
         }
         4.0 * sum / rows as f64
     }

@@ -4,7 +4,7 @@ use super::NONE;
 use super::tree::Found;
 
 /// Candidates that are looked up at once.
-const COUNT: usize = 12;
+pub(super) const COUNT: usize = 16;
 
 /// Where the columns of a row come from.
 pub(super) trait Candidates {
@@ -15,6 +15,11 @@ pub(super) trait Candidates {
     /// Replaces `found` by at least the `count` columns of a row with the least cost − price; returns what no other column is
     /// below, +∞ if there is none.
     fn nearest(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64;
+    /// The same of the columns that are not closed; those with a cost of their own may be missing.
+    fn nearest_open(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64;
+    /// Passes over a column in [`Self::nearest_open`] until it is opened again.
+    fn close(&mut self, col: u32);
+    fn reopen(&mut self, col: u32);
     /// Appends every column of a row with cost − price up to `limit`.
     fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>);
     /// The prices have fallen.
@@ -53,7 +58,7 @@ pub(super) struct Engine<C> {
     pub(super) row_of_col: Vec<u32>,
     /// Price changes of which the source does not know.
     changes: usize,
-    found: Vec<Found>,
+    pub(super) found: Vec<Found>,
 }
 
 impl<C: Candidates> Engine<C> {
@@ -81,12 +86,17 @@ impl<C: Candidates> Engine<C> {
         self.changes += 1;
     }
 
-    /// Looks up the cheapest columns of a row anew.
-    pub(super) fn look_up(&mut self, row: u32, count: usize) {
-        if self.changes * 4 > self.price.len() {
+    /// Brings the source's prices up to date, if more than so many have changed.
+    pub(super) fn reprice(&mut self, most: usize) {
+        if self.changes > most {
             self.source.reprice(&self.price);
             self.changes = 0;
         }
+    }
+
+    /// Looks up the cheapest columns of a row anew.
+    pub(super) fn look_up(&mut self, row: u32, count: usize) {
+        self.reprice(self.price.len() / 8);
         let list = &mut self.lists[row as usize];
         list.bound = self.source.nearest(row, count, &self.price, &mut self.found);
         list.entries.clear();

@@ -150,6 +150,14 @@ impl Candidates for &List {
         f64::INFINITY
     }
 
+    fn nearest_open(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
+        self.nearest(row, count, price, found)
+    }
+
+    fn close(&mut self, _: u32) {}
+
+    fn reopen(&mut self, _: u32) {}
+
     fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>) {
         let near = |&&(col, cost): &&(u32, f64)| self.priced(row as usize, col, cost) - price[col as usize] <= limit;
         found.extend(self.of(row as usize).iter().filter(near).map(|pair| pair.0));

@@ -1,14 +1,15 @@
 //! Assignment of agents to goals by distance, without a cost matrix.
 
 use super::candidates::Candidates;
+use super::costs::{Metric, OwnCost, OwnCosts};
 use super::tree::{Found, Tree};
 use super::{Order, solve};
-use crate::points::{check_points, check_power, powered_square};
+use crate::points::{check_points, check_power};
 use crate::ties::Exact;
 use crate::{AssignError, Assignment, LARGEST_COST, Solver, Span, Switching, UNASSIGNED, compensated_sum, costs_into};
 
-/// Cells of the longer side from which on the matrix is left out: below, reading it is faster.
-const WORTH_IT: usize = 200;
+/// Members of the longer side from which on the matrix is left out: below, reading it is faster.
+pub(super) const WORTH_IT: usize = 1000;
 
 /// Agents and goals; a pair costs distance^power, unless it has a cost of its own.
 #[derive(Debug, Clone, Copy)]
@@ -49,7 +50,19 @@ pub fn solve_points<T: Copy + Into<f64>>(
         let cost = matrix(problem)?;
         return Solver::default().solve_switching(&cost, rows, cols, &problem.switching, should_continue);
     }
-    solve_sparse(problem, rows, cols, f64::INFINITY, should_continue)
+    solve_sparse(problem, rows, cols, Limit::NONE, should_continue)
+}
+
+/// Largest cost of a pair.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limit {
+    pub(super) cost: f64,
+    /// Whether it leaves a matching of the whole shorter side.
+    pub(super) complete: bool,
+}
+
+impl Limit {
+    pub(super) const NONE: Self = Self { cost: f64::INFINITY, complete: false };
 }
 
 /// The matrix of all costs.
@@ -80,12 +93,12 @@ pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Resul
     Ok((rows, cols))
 }
 
-/// Without the matrix; pairs that cost more than `limit` are forbidden.
+/// Without the matrix; pairs that cost more than the limit are forbidden.
 pub(super) fn solve_sparse<T: Copy + Into<f64>>(
     problem: &PointProblem<'_, T>,
     rows: usize,
     cols: usize,
-    limit: f64,
+    limit: Limit,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     match problem.dims {
@@ -99,14 +112,14 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
     problem: &PointProblem<'_, T>,
     rows: usize,
     cols: usize,
-    limit: f64,
+    limit: Limit,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     let turned = rows > cols;
-    let metric = Metric { power: problem.power, limit };
+    let metric = Metric { power: problem.power, limit: limit.cost };
     let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
     let own = own_costs(problem, &agents, &goals, metric);
-    let sink = sink(&own, &agents, &goals, metric)?;
+    let sink = sink(&own, &agents, &goals, metric)?.filter(|_| !limit.complete);
     let (short, long) = if turned { (&goals, &agents) } else { (&agents, &goals) };
     // Neighbours in space become neighbours in memory.
     let (tree, col_at) = Tree::new(long);
@@ -137,99 +150,6 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
 
 pub(super) fn points_of<T: Copy + Into<f64>, const D: usize>(values: &[T]) -> Vec<[f64; D]> {
     values.as_chunks::<D>().0.iter().map(|point| point.map(Into::into)).collect()
-}
-
-/// distance^power, and +∞ beyond the limit.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Metric {
-    pub(super) power: f64,
-    pub(super) limit: f64,
-}
-
-impl Metric {
-    pub(super) fn cost<const D: usize>(&self, from: &[f64; D], to: &[f64; D]) -> f64 {
-        let mut square = 0.0;
-        for axis in 0..D {
-            let difference = from[axis] - to[axis];
-            square += difference * difference;
-        }
-        let cost = powered_square(square, self.power);
-        if cost <= self.limit { cost } else { f64::INFINITY }
-    }
-
-    /// No point that is at least as far along every axis costs less.
-    pub(super) fn at_least<const D: usize>(&self, apart: &[f64; D]) -> f64 {
-        let mut square = 0.0;
-        for apart in apart {
-            square += apart * apart;
-        }
-        let cost = powered_square(square, self.power);
-        // Roots, products and sums are monotone after rounding, too; nothing says so of other powers.
-        if self.power <= 2.0 { cost } else { cost * (1.0 - 1e-14) }
-    }
-}
-
-/// A pair with a cost of its own: the sum of two doubles.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct OwnCost {
-    pub(super) row: u32,
-    pub(super) col: u32,
-    pub(super) terms: [f64; 2],
-    pub(super) current: bool,
-}
-
-impl OwnCost {
-    pub(super) fn cost(&self) -> f64 {
-        self.terms[0] + self.terms[1]
-    }
-}
-
-/// Pairs with costs of their own, sorted by row and column.
-#[derive(Debug, Default)]
-pub(super) struct OwnCosts {
-    /// Where each row begins; empty without such pairs.
-    start: Vec<usize>,
-    pairs: Vec<OwnCost>,
-}
-
-impl OwnCosts {
-    /// Of a list in which the last one of a pair counts.
-    fn new(mut pairs: Vec<OwnCost>, rows: usize) -> Self {
-        if pairs.is_empty() {
-            return Self::default();
-        }
-        pairs.reverse();
-        pairs.sort_by_key(|pair| (pair.row, pair.col));
-        pairs.dedup_by_key(|pair| (pair.row, pair.col));
-        let start = (0..=rows as u32).map(|row| pairs.partition_point(|pair| pair.row < row)).collect();
-        Self { start, pairs }
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.pairs.is_empty()
-    }
-
-    pub(super) fn of(&self, row: usize) -> &[OwnCost] {
-        if self.start.is_empty() { &[] } else { &self.pairs[self.start[row]..self.start[row + 1]] }
-    }
-
-    pub(super) fn get(&self, row: usize, col: usize) -> Option<&OwnCost> {
-        let pairs = self.of(row);
-        pairs.binary_search_by_key(&(col as u32), |pair| pair.col).ok().map(|place| &pairs[place])
-    }
-
-    /// The same with other numbers for rows and columns.
-    pub(super) fn places(&self, row_at: &[u32], place_of_col: &[u32]) -> Self {
-        let mut pairs = Vec::with_capacity(self.pairs.len());
-        for (place, &row) in row_at.iter().enumerate().filter(|_| !self.pairs.is_empty()) {
-            pairs.extend(self.of(row as usize).iter().map(|pair| OwnCost {
-                row: place as u32,
-                col: place_of_col[pair.col as usize],
-                ..*pair
-            }));
-        }
-        Self::new(pairs, row_at.len())
-    }
 }
 
 /// The pairs with costs of their own as the solver sees them: its rows are the shorter side.
@@ -313,7 +233,7 @@ impl<const D: usize> Candidates for Points<D> {
         let own = self.own.of(row as usize);
         // Those pairs would be counted twice; beyond the others they cost what they cost.
         let from = &self.from[row as usize];
-        let bound = self.tree.nearest(from, count + own.len(), &self.metric, price, found);
+        let bound = self.tree.nearest(from, count + own.len(), false, &self.metric, price, found);
         if !own.is_empty() {
             found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
             for pair in own.iter().filter(|pair| pair.terms[0] < f64::INFINITY) {
@@ -322,6 +242,23 @@ impl<const D: usize> Candidates for Points<D> {
             }
         }
         bound
+    }
+
+    fn nearest_open(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
+        let own = self.own.of(row as usize);
+        let bound = self.tree.nearest(&self.from[row as usize], count + own.len(), true, &self.metric, price, found);
+        if !own.is_empty() {
+            found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
+        }
+        bound
+    }
+
+    fn close(&mut self, col: u32) {
+        self.tree.close(col);
+    }
+
+    fn reopen(&mut self, col: u32) {
+        self.tree.reopen(col);
     }
 
     fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>) {

@@ -1,5 +1,5 @@
 use super::pairs::{AllowedPairs, solve_pairs};
-use super::points::{PointProblem, check, matrix, solve_sparse};
+use super::points::{Limit, PointProblem, check, matrix, solve_sparse};
 use super::threshold::bottleneck_sparse;
 use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
 use magex_core::rng::{Key, Purpose, Stream};
@@ -73,7 +73,7 @@ fn compare(first: u32, count: u32, most: u32) {
         let (rows, cols) = check(&problem).unwrap();
         let cost = matrix(&problem).unwrap();
         let expected = solver.solve_switching(&cost, rows, cols, &problem.switching, &|| true).unwrap();
-        let found = solve_sparse(&problem, rows, cols, f64::INFINITY, &|| true).unwrap();
+        let found = solve_sparse(&problem, rows, cols, Limit::NONE, &|| true).unwrap();
         assert_eq!(found, expected, "points {index}");
         let pairs: Vec<(u32, u32, f64)> =
             (0..rows * cols).map(|place| ((place / cols) as u32, (place % cols) as u32, cost[place])).collect();
@@ -94,7 +94,7 @@ fn points_and_pairs_have_the_answers_of_the_matrix() {
 
 #[test]
 fn without_a_matrix_a_solver_that_is_told_to_stop_stops() {
-    let points: Vec<f64> = (0..800).map(|k| f64::from(k * k % 97)).collect();
+    let points: Vec<f64> = (0..2400).map(|k| f64::from(k * k % 97)).collect();
     let problem = PointProblem::new(&points, &points, 2);
     let stop = |calls: u32| {
         let left = std::cell::Cell::new(calls);

@@ -6,12 +6,10 @@
 //! pair that leads out of what was reached is the next candidate.
 
 use super::NONE;
-use super::points::{Metric, OwnCosts, PointProblem, check, matrix, own_costs, points_of, solve_sparse};
-use super::tree::{Left, Tree};
+use super::costs::{Metric, OwnCost, OwnCosts};
+use super::points::{Limit, PointProblem, WORTH_IT, check, matrix, own_costs, points_of, solve_sparse};
+use super::tree::Tree;
 use crate::{AssignError, Assignment, BottleneckSolver, UNASSIGNED, pairs};
-
-/// Members of the longer side from which on the matrix is left out.
-const WORTH_IT: usize = 200;
 
 /// As many pairs as possible, then the smallest largest cost, then as [`super::solve_points`]: the answer of
 /// [`BottleneckSolver::solve_switching`] of the matrix of costs, in memory that grows with the points only.
@@ -48,11 +46,11 @@ pub(super) fn bottleneck_sparse<T: Copy + Into<f64>>(
     }
 }
 
-/// The smallest largest cost; none if all pairs are forbidden.
+/// The smallest largest cost; nothing if all pairs are forbidden.
 fn threshold<T: Copy + Into<f64>, const D: usize>(
     problem: &PointProblem<'_, T>,
     should_continue: &dyn Fn() -> bool,
-) -> Result<Option<f64>, AssignError> {
+) -> Result<Option<Limit>, AssignError> {
     let metric = Metric { power: problem.power, limit: f64::INFINITY };
     let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
     let own = own_costs(problem, &agents, &goals, metric);
@@ -63,7 +61,8 @@ fn threshold<T: Copy + Into<f64>, const D: usize>(
     (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
     let mut matching = Matching {
         from: row_at.iter().map(|&row| short[row as usize]).collect(),
-        left: Left::new(tree),
+        free: tree.clone(),
+        left: tree,
         metric,
         own: own.places(&row_at, &place_of_col),
         col_of_row: vec![NONE; short.len()],
@@ -76,7 +75,9 @@ fn threshold<T: Copy + Into<f64>, const D: usize>(
 /// A matching of pairs up to a threshold.
 struct Matching<const D: usize> {
     from: Vec<[f64; D]>,
-    left: Left<D>,
+    /// Columns that a round has not met yet, and those of them without a row.
+    left: Tree<D>,
+    free: Tree<D>,
     metric: Metric,
     own: OwnCosts,
     col_of_row: Vec<u32>,
@@ -86,7 +87,7 @@ struct Matching<const D: usize> {
 }
 
 impl<const D: usize> Matching<D> {
-    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<f64>, AssignError> {
+    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
         let rows = self.from.len();
         // The dearest of the rows' cheapest pairs is a lower bound.
         let mut low = f64::NEG_INFINITY;
@@ -130,7 +131,7 @@ impl<const D: usize> Matching<D> {
                 limit = low;
             }
         }
-        Ok(Some(high))
+        Ok(Some(Limit { cost: high, complete: target == rows }))
     }
 
     /// Makes the matching a largest one of pairs up to the limit; returns its size.
@@ -148,6 +149,12 @@ impl<const D: usize> Matching<D> {
                 return Err(AssignError::Interrupted);
             }
             self.left.restore();
+            self.free.restore();
+            for col in 0..self.row_of_col.len() as u32 {
+                if self.row_of_col[col as usize] != NONE {
+                    self.free.close(col);
+                }
+            }
             self.reached.clear();
             let (mut free, mut grown) = (0, 0);
             for row in 0..rows {
@@ -183,28 +190,32 @@ impl<const D: usize> Matching<D> {
         }
     }
 
-    /// Takes a column that is left and not dearer than the limit.
+    /// Takes a column that is left and not dearer than the limit: one without a row first, then the cheapest, which leaves the
+    /// matching mostly as it is when the limit falls.
     fn reach(&mut self, row: u32, limit: f64) -> Option<u32> {
-        let Self { own, left, from, metric, .. } = self;
-        let listed = own.of(row as usize);
-        let near = |pair: &&super::points::OwnCost| pair.terms[0] <= limit && left.is_left(pair.col);
-        let usable = |pair: &&super::points::OwnCost| pair.terms[0] < f64::INFINITY;
-        let found = match listed.iter().filter(usable).find(near) {
-            Some(pair) => Some(pair.col),
-            None => {
-                let skip = |col: u32| own.get(row as usize, col as usize).is_some();
-                left.find(&from[row as usize], metric, limit, false, skip).map(|found| found.0)
+        let Self { own, left, free, from, metric, .. } = self;
+        let (from, skip) = (&from[row as usize], |col: u32| own.get(row as usize, col as usize).is_some());
+        let listed = own.of(row as usize).iter();
+        let near = |pair: &&OwnCost| pair.terms[0] <= limit && pair.terms[0] < f64::INFINITY && left.is_open(pair.col);
+        let mut found = listed.clone().find(|pair| near(pair) && free.is_open(pair.col)).map(|pair| pair.col);
+        found = found.or_else(|| free.cheapest(from, metric, limit, skip).map(|found| found.0));
+        found = found.or_else(|| listed.clone().find(near).map(|pair| pair.col));
+        found = found.or_else(|| left.cheapest(from, metric, limit, skip).map(|found| found.0));
+        if let Some(col) = found {
+            left.close(col);
+            if free.is_open(col) {
+                free.close(col);
             }
-        };
-        found.inspect(|&col| left.take(col))
+        }
+        found
     }
 
     /// The cheapest pair of a row with a column that is left.
     fn cheapest(&mut self, row: u32) -> Option<f64> {
         let Self { own, left, from, metric, .. } = self;
         let skip = |col: u32| own.get(row as usize, col as usize).is_some();
-        let found = left.find(&from[row as usize], metric, f64::INFINITY, true, skip).map(|found| found.1);
-        let listed = own.of(row as usize).iter().filter(|pair| pair.terms[0] < f64::INFINITY && left.is_left(pair.col));
+        let found = left.cheapest(&from[row as usize], metric, f64::INFINITY, skip).map(|found| found.1);
+        let listed = own.of(row as usize).iter().filter(|pair| pair.terms[0] < f64::INFINITY && left.is_open(pair.col));
         listed.map(|pair| pair.terms[0]).chain(found).min_by(f64::total_cmp)
     }
 

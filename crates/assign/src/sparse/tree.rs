@@ -4,7 +4,7 @@
 //! at least the cost of the nearest point of its box less that price, so most nodes are never opened. Prices only fall: a price
 //! that is out of date is too large, which keeps the bound valid.
 
-use super::points::Metric;
+use super::costs::Metric;
 
 /// Points of a leaf, at most.
 const LEAF: usize = 8;
@@ -27,6 +27,9 @@ pub(super) struct Tree<const D: usize> {
     nodes: Vec<Node<D>>,
     /// `[points]` in the tree's order.
     points: Vec<[f64; D]>,
+    /// `[points]` points that are passed over, and `[nodes]` points below each node that are not.
+    closed: Vec<bool>,
+    open: Vec<u32>,
     stack: Vec<(u32, f64)>,
 }
 
@@ -34,9 +37,11 @@ impl<const D: usize> Tree<D> {
     /// The tree, and the index of the point at each of its places.
     pub(super) fn new(points: &[[f64; D]]) -> (Self, Vec<u32>) {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
-        let mut tree = Self { nodes: Vec::new(), points: Vec::new(), stack: Vec::new() };
+        let (nodes, open) = (Vec::new(), Vec::new());
+        let mut tree = Self { nodes, points: Vec::new(), closed: vec![false; points.len()], open, stack: Vec::new() };
         tree.split(points, &mut order, 0);
         tree.points = order.iter().map(|&point| points[point as usize]).collect();
+        tree.open = tree.nodes.iter().map(|node| node.end - node.start).collect();
         (tree, order)
     }
 
@@ -97,12 +102,48 @@ impl<const D: usize> Tree<D> {
         metric.at_least(&nearest) - node.largest_price
     }
 
+    /// Passes over a point until it is opened again.
+    pub(super) fn close(&mut self, point: u32) {
+        self.closed[point as usize] = true;
+        self.count(point, |open| *open -= 1);
+    }
+
+    pub(super) fn reopen(&mut self, point: u32) {
+        self.closed[point as usize] = false;
+        self.count(point, |open| *open += 1);
+    }
+
+    /// Changes the count of every node above a point.
+    fn count(&mut self, point: u32, change: impl Fn(&mut u32)) {
+        let mut place = 0;
+        loop {
+            change(&mut self.open[place as usize]);
+            let second = self.nodes[place as usize].second;
+            if second == 0 {
+                return;
+            }
+            place = if point < self.nodes[second as usize].start { place + 1 } else { second };
+        }
+    }
+
+    pub(super) fn is_open(&self, point: u32) -> bool {
+        !self.closed[point as usize]
+    }
+
+    /// Opens all points.
+    pub(super) fn restore(&mut self) {
+        self.closed.fill(false);
+        self.open.clear();
+        self.open.extend(self.nodes.iter().map(|node| node.end - node.start));
+    }
+
     /// Replaces `found` by the `count` places with the least cost − price, with their costs, and returns what no other place is
-    /// below; +∞ if there is no other.
+    /// below; +∞ if there is no other. Closed places are passed over if `only_open`.
     pub(super) fn nearest(
         &mut self,
         from: &[f64; D],
         count: usize,
+        only_open: bool,
         metric: &Metric,
         price: &[f64],
         found: &mut Vec<Found>,
@@ -113,7 +154,7 @@ impl<const D: usize> Tree<D> {
         stack.clear();
         stack.push((0, self.bound(0, from, metric)));
         while let Some((place, bound)) = stack.pop() {
-            if bound >= limit {
+            if bound >= limit || (only_open && self.open[place as usize] == 0) {
                 continue;
             }
             let &Node { start, end, second, .. } = &self.nodes[place as usize];
@@ -129,6 +170,9 @@ impl<const D: usize> Tree<D> {
                 continue;
             }
             for col in start..end {
+                if only_open && self.closed[col as usize] {
+                    continue;
+                }
                 let cost = metric.cost(from, &self.points[col as usize]);
                 let reduced = cost - price[col as usize];
                 if reduced >= limit {
@@ -151,6 +195,44 @@ impl<const D: usize> Tree<D> {
         limit
     }
 
+    /// The cheapest open place that costs up to `limit` and is not to be skipped, and its cost.
+    pub(super) fn cheapest(
+        &mut self,
+        from: &[f64; D],
+        metric: &Metric,
+        mut limit: f64,
+        skip: impl Fn(u32) -> bool,
+    ) -> Option<(u32, f64)> {
+        let mut found = None;
+        let mut stack = std::mem::take(&mut self.stack);
+        stack.clear();
+        stack.push((0, self.bound(0, from, metric)));
+        while let Some((place, bound)) = stack.pop() {
+            if bound > limit || self.open[place as usize] == 0 {
+                continue;
+            }
+            let &Node { start, end, second, .. } = &self.nodes[place as usize];
+            if second != 0 {
+                let (first, other) = (place + 1, second);
+                let (near, far) = (self.bound(first, from, metric), self.bound(other, from, metric));
+                if near <= far {
+                    stack.extend([(other, far), (first, near)]);
+                } else {
+                    stack.extend([(first, near), (other, far)]);
+                }
+                continue;
+            }
+            for point in (start..end).filter(|&point| !self.closed[point as usize] && !skip(point)) {
+                let cost = metric.cost(from, &self.points[point as usize]);
+                if cost < limit || (found.is_none() && cost == limit && cost < f64::INFINITY) {
+                    (found, limit) = (Some((point, cost)), cost);
+                }
+            }
+        }
+        self.stack = stack;
+        found
+    }
+
     /// Appends every place with cost − price up to `limit`.
     pub(super) fn within(&mut self, from: &[f64; D], limit: f64, metric: &Metric, price: &[f64], found: &mut Vec<u32>) {
         let mut stack = std::mem::take(&mut self.stack);
@@ -169,95 +251,6 @@ impl<const D: usize> Tree<D> {
             found.extend((start..end).filter(near));
         }
         self.stack = stack;
-    }
-}
-
-/// The points of a tree that were not taken yet.
-#[derive(Debug, Clone)]
-pub(super) struct Left<const D: usize> {
-    tree: Tree<D>,
-    /// Points left below each node.
-    below: Vec<u32>,
-    taken: Vec<bool>,
-}
-
-impl<const D: usize> Left<D> {
-    pub(super) fn new(tree: Tree<D>) -> Self {
-        let mut left = Self { below: Vec::new(), taken: Vec::new(), tree };
-        left.restore();
-        left
-    }
-
-    /// Puts all points back.
-    pub(super) fn restore(&mut self) {
-        self.below.clear();
-        self.below.extend(self.tree.nodes.iter().map(|node| node.end - node.start));
-        self.taken.clear();
-        self.taken.resize(self.tree.points.len(), false);
-    }
-
-    pub(super) fn points(&self) -> &[[f64; D]] {
-        &self.tree.points
-    }
-
-    pub(super) fn is_left(&self, point: u32) -> bool {
-        !self.taken[point as usize]
-    }
-
-    /// Takes a point that is left.
-    pub(super) fn take(&mut self, point: u32) {
-        self.taken[point as usize] = true;
-        let mut place = 0;
-        loop {
-            self.below[place as usize] -= 1;
-            let second = self.tree.nodes[place as usize].second;
-            if second == 0 {
-                return;
-            }
-            place = if point < self.tree.nodes[second as usize].start { place + 1 } else { second };
-        }
-    }
-
-    /// A point that is left, costs up to `limit` and is not to be skipped; the cheapest one if `cheapest`.
-    pub(super) fn find(
-        &mut self,
-        from: &[f64; D],
-        metric: &Metric,
-        mut limit: f64,
-        cheapest: bool,
-        skip: impl Fn(u32) -> bool,
-    ) -> Option<(u32, f64)> {
-        let mut found = None;
-        let mut stack = std::mem::take(&mut self.tree.stack);
-        stack.clear();
-        stack.push((0, self.tree.bound(0, from, metric)));
-        'open: while let Some((place, bound)) = stack.pop() {
-            if self.below[place as usize] == 0 || bound > limit {
-                continue;
-            }
-            let &Node { start, end, second, .. } = &self.tree.nodes[place as usize];
-            if second != 0 {
-                let (first, other) = (place + 1, second);
-                let (near, far) = (self.tree.bound(first, from, metric), self.tree.bound(other, from, metric));
-                if near <= far {
-                    stack.extend([(other, far), (first, near)]);
-                } else {
-                    stack.extend([(first, near), (other, far)]);
-                }
-                continue;
-            }
-            for point in (start..end).filter(|&point| !self.taken[point as usize] && !skip(point)) {
-                let cost = metric.cost(from, &self.tree.points[point as usize]);
-                if cost <= limit && cost < f64::INFINITY {
-                    (found, limit) = (Some((point, cost)), cost);
-                    if !cheapest {
-                        break 'open;
-                    }
-                }
-            }
-        }
-        self.tree.stack = stack;
-        found
     }
 }
 

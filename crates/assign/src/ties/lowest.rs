@@ -106,6 +106,8 @@ struct Choice<'a> {
     spare: Option<&'a [bool]>,
     /// Agents that have chosen: one with a goal keeps it, one without may only change what stands for none.
     settled: Vec<bool>,
+    /// Those with a goal.
+    closed: Vec<bool>,
     /// Round in which each agent was asked last, and the one in whose place it would have to go.
     asked: Vec<u32>,
     asked_by: Vec<u32>,
@@ -129,6 +131,7 @@ impl<'a> Choice<'a> {
             idle: None,
             spare: None,
             settled: vec![false; agents],
+            closed: vec![false; agents],
             asked: vec![0; agents],
             asked_by: vec![NONE; agents],
             takes: vec![NONE; agents],
@@ -146,7 +149,7 @@ impl<'a> Choice<'a> {
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Option<usize>, AssignError> {
         let mut round = 0;
-        self.settled[..first].fill(true);
+        (0..first).for_each(|agent| self.settle(agent, forbidden));
         for agent in first..self.goals.rows() {
             if self.goals.of(agent).is_empty() {
                 continue;
@@ -159,13 +162,15 @@ impl<'a> Choice<'a> {
             let none = now == NONE || forbidden(agent, now as usize);
             let goals = self.goals;
             let lower = goals.of(agent).iter().take_while(|&&goal| none || goal < now);
-            for &goal in lower.filter(|&&goal| !forbidden(agent, goal as usize)) {
-                if self.can_have(agent as u32, goal, round, forbidden) {
+            for &goal in lower {
+                let holder = self.agent_of[goal as usize];
+                let kept = holder != NONE && self.closed[holder as usize];
+                if !kept && !forbidden(agent, goal as usize) && self.can_have(agent as u32, goal, round, forbidden) {
                     self.exchange(agent as u32, goal);
                     break;
                 }
             }
-            self.settled[agent] = true;
+            self.settle(agent, forbidden);
             if self.looked > LOOKS * self.goals.cols.len() + 10_000 {
                 return Ok(Some(agent + 1));
             }
@@ -173,9 +178,10 @@ impl<'a> Choice<'a> {
         Ok(None)
     }
 
-    fn chosen(&self, agent: u32, forbidden: &dyn Fn(usize, usize) -> bool) -> bool {
-        let goal = self.goal_of[agent as usize];
-        self.settled[agent as usize] && goal != NONE && !forbidden(agent as usize, goal as usize)
+    fn settle(&mut self, agent: usize, forbidden: &dyn Fn(usize, usize) -> bool) {
+        let goal = self.goal_of[agent];
+        self.settled[agent] = true;
+        self.closed[agent] = goal != NONE && !forbidden(agent, goal as usize);
     }
 
     /// Whether everyone who has to make room for `agent` at `goal` finds another place; `asked_by` and `takes` then lead there.
@@ -247,7 +253,7 @@ impl<'a> Choice<'a> {
             return false;
         }
         let at = holder as usize;
-        if holder != first && (self.asked[at] == round || self.chosen(holder, forbidden)) {
+        if holder != first && (self.asked[at] == round || self.closed[at]) {
             return false;
         }
         (self.asked[at], self.asked_by[at]) = (round, by);
