@@ -316,7 +316,7 @@ fn requests() -> Vec<Bytes> {
     let member = |id: &str, place: usize| v1::Member {
         id: id.into(),
         position: [vec![0.0, 1.0], vec![4.0, 0.5], vec![-2.0, 3.25]][place].clone(),
-        state: 0,
+        ..Default::default()
     };
     let positions = |coordinates| v1::Positions { dims: 2, coordinates, array: None };
     let pair =

@@ -68,6 +68,7 @@ fn the_nemesis_finds_nothing() {
         let all: Vec<&Fault> = faults.iter().filter(|fault| target.can(fault) && !(calm && fault.kills())).collect();
         let fault = all[stream.below(all.len() as u32) as usize];
         *told.entry(fault.name()).or_default() += 1;
+        println!("{:>6.1} s: {}", start.elapsed().as_secs_f64(), fault.name());
         if calm {
             target.watch_memory();
         }
