@@ -41,7 +41,8 @@ fn run(name: &str, examples: Vec<Vec<u8>>, count: usize, target: impl Fn(&[u8]))
 }
 
 fn team() -> v1::AssignRequest {
-    let points = |coordinates: &[f64]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
+    let points =
+        |coordinates: &[f64]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() });
     let pair =
         |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
     v1::AssignRequest {

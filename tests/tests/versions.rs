@@ -318,7 +318,7 @@ fn requests() -> Vec<Bytes> {
         position: [vec![0.0, 1.0], vec![4.0, 0.5], vec![-2.0, 3.25]][place].clone(),
         ..Default::default()
     };
-    let positions = |coordinates| v1::Positions { dims: 2, coordinates, array: None };
+    let positions = |coordinates| v1::Positions { dims: 2, coordinates, ..Default::default() };
     let pair =
         |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
     let team = v1::AssignRequest {

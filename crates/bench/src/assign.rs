@@ -180,7 +180,7 @@ fn quality_rows(report: &mut Report, args: &AssignArgs, weights: &[u8], config: 
 fn team(n: usize, index: u32, scheduler: v1::AssignmentMethod) -> v1::AssignRequest {
     let (agents, goals) = uniform_points(n, index);
     let points = |points: Vec<f32>| {
-        Some(v1::Positions { dims: 2, coordinates: points.into_iter().map(f64::from).collect(), array: None })
+        Some(v1::Positions { dims: 2, coordinates: points.into_iter().map(f64::from).collect(), ..Default::default() })
     };
     let scheduler = scheduler.into();
     v1::AssignRequest { agents: points(agents), goals: points(goals), scheduler, ..Default::default() }

@@ -291,6 +291,7 @@ fn deadline(seconds: f64) -> Result<Duration, ConvertError> {
 
 fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Result<(Vec<f64>, usize), ConvertError> {
     let positions = positions.ok_or_else(|| ConvertError::missing(field))?;
+    single_precision(&positions.single_coordinates, || format!("{field}.single_coordinates"))?;
     let (values, dims) = match positions.array {
         Some(array) => {
             let path = format!("{field}.array");
@@ -312,6 +313,15 @@ fn points(field: &str, positions: Option<v1::Positions>, limits: &Limits) -> Res
     })?;
     coordinates(&values, |place| format!("{field}.coordinates[{place}]"))?;
     Ok((values, dims))
+}
+
+/// Refuses what a client of an earlier release sends in place of coordinates: without it the team would look empty.
+pub(crate) fn single_precision(values: &[f32], path: impl Fn() -> String) -> Result<(), ConvertError> {
+    ConvertError::ensure(values.is_empty(), || {
+        let problem = "coordinates in single precision, as clients of 0.2.0 and before send them; generate the client's stubs anew \
+                       from proto/: coordinates are double now";
+        (path(), problem.to_owned())
+    })
 }
 
 /// Checks coordinates; `path` is the field of each.

@@ -72,7 +72,7 @@ fn ask(team: v1::AssignRequest) -> v1::AssignResponse {
 }
 
 fn line(xs: &[f64]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims: 2, coordinates: xs.iter().flat_map(|x| [*x, 0.0]).collect(), array: None })
+    Some(v1::Positions { dims: 2, coordinates: xs.iter().flat_map(|x| [*x, 0.0]).collect(), ..Default::default() })
 }
 
 fn chosen(answer: &v1::AssignResponse) -> Vec<(u32, u32)> {

@@ -17,7 +17,7 @@ fn limits() -> Limits {
 }
 
 fn positions(dims: u32, coordinates: &[f64]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims, coordinates: coordinates.to_vec(), array: None })
+    Some(v1::Positions { dims, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
 fn team(agents: &[f64], goals: &[f64]) -> v1::AssignRequest {
@@ -159,6 +159,10 @@ fn wrong_fields_are_named() {
     check(|m| m.goals = None, "goals: missing");
     check(|m| m.goals = positions(0, &[1.0]), "goals.dims: 0");
     check(|m| m.goals = positions(2, &[1.0]), "goals.coordinates: 1 numbers");
+    check(
+        |m| m.agents = Some(v1::Positions { dims: 2, single_coordinates: vec![1.0, 2.0], ..Default::default() }),
+        "agents.single_coordinates: coordinates in single precision",
+    );
     check(|m| m.goals = positions(4, &[1.0; 4]), "goals.dims: 4");
     check(|m| m.goals = positions(3, &[1.0; 3]), "goals: 3 dimensions, the agents have 2");
     check(|m| m.goals = positions(2, &[0.0; 26]), "goals: 13 points exceed the limit of 12");

@@ -38,7 +38,7 @@ fn team(words: &[&str], stream: &mut Stream) -> v1::AssignRequest {
     let has = |word: &str| words.contains(&word);
     let each = |count: usize, draw: &mut dyn FnMut() -> f64| (0..count).map(|_| draw()).collect::<Vec<f64>>();
     let mut draw = |low: f64, high: f64| stream.range(low, high);
-    let points = |values: Vec<f64>| Some(v1::Positions { dims: 2, coordinates: values, array: None });
+    let points = |values: Vec<f64>| Some(v1::Positions { dims: 2, coordinates: values, ..Default::default() });
     let mut team = v1::AssignRequest::default();
     if has("costs") {
         let values = each(n * g, &mut || draw(0.0, 10.0));
@@ -267,7 +267,8 @@ fn switching_costs_are_in_the_unit_after_the_power() {
 #[test]
 fn wrong_words_and_contradictions_are_named() {
     let check = |change: fn(&mut v1::AssignRequest), words: &str| {
-        let points = |values: &[f64]| Some(v1::Positions { dims: 2, coordinates: values.to_vec(), array: None });
+        let points =
+            |values: &[f64]| Some(v1::Positions { dims: 2, coordinates: values.to_vec(), ..Default::default() });
         let mut team = v1::AssignRequest {
             agents: points(&[0.0, 0.0, 2.0, 2.0]),
             goals: points(&[1.0, 1.0, 3.0, 1.0]),
@@ -353,7 +354,8 @@ fn wrong_words_and_contradictions_are_named() {
 
 #[test]
 fn positions_keep_their_digits() {
-    let points = |dims: u32, points: &[&[f64]]| Some(v1::Positions { dims, coordinates: points.concat(), array: None });
+    let points =
+        |dims: u32, points: &[&[f64]]| Some(v1::Positions { dims, coordinates: points.concat(), ..Default::default() });
     let solve = |dims: u32, agents: &[&[f64]], goals: &[&[f64]]| {
         let team = v1::AssignRequest { agents: points(dims, agents), goals: points(dims, goals), ..Default::default() };
         let problem = Problem::read(team, 1, &LIMITS).unwrap();

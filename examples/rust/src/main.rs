@@ -35,7 +35,8 @@ async fn main() -> anyhow::Result<()> {
     });
 
     // Three robots, three charging stations, and a robot that must not use the first one.
-    let points = |coordinates: &[f64]| Some(Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
+    let points =
+        |coordinates: &[f64]| Some(Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() });
     let names = |names: [&str; 3]| names.map(str::to_owned).to_vec();
     let request = AssignRequest {
         agents: points(&[0.0, 0.0, 4.0, 0.0, 8.0, 0.0]),

@@ -16,7 +16,7 @@ use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus}
 use tonic_types::StatusExt as _;
 
 pub(crate) fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
+    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
 /// Two agents, for a model; the goal of each is nearest to the other's place in the list.

@@ -22,7 +22,7 @@ async fn health(client: &mut HealthClient<Channel>) -> ServingStatus {
 }
 
 fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
+    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,7 +1,7 @@
 //! Checks the members and settings of a mission in requests and records.
 
 use super::{MissionLimits, Names, TRAINING_PREFIX};
-use crate::problem::{LONGEST_ID, check_name, coordinates, pair_cost, scheduler, switching_cost};
+use crate::problem::{LONGEST_ID, check_name, coordinates, pair_cost, scheduler, single_precision, switching_cost};
 use crate::terms::{DURATIONS, SPEEDS, TIMES, WEIGHTS, no_circle, power, within};
 use magex_proto::convert::ConvertError;
 use magex_proto::goals::AssignmentMethod;
@@ -107,6 +107,7 @@ pub(super) fn merge(
             let problem = format!("{} is not a state; use active, failed or finished", update.state);
             ConvertError::new(path("state"), problem)
         })?;
+        single_precision(&update.single_position, || path("single_position"))?;
         coordinates(&update.position, |place| format!("{field}[{k}].position[{place}]"))?;
         let count = update.position.len();
         // A name that is not known and has no position is a slip, unless its pairs have costs.

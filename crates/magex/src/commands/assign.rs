@@ -383,7 +383,7 @@ fn positions(field: &str, points: &[Vec<f64>]) -> anyhow::Result<v1::Positions> 
         let wrong = points[place].len();
         return Err(usage(format!("{field}[{place}]: {wrong} coordinates, the first point has {dims}")));
     }
-    Ok(v1::Positions { dims: dims as u32, coordinates: points.concat(), array: None })
+    Ok(v1::Positions { dims: dims as u32, coordinates: points.concat(), ..Default::default() })
 }
 
 #[cfg(test)]
