@@ -296,7 +296,11 @@ fn bad_input_is_refused_with_the_field_and_the_remedy() {
         ("eval run --controller fastest", 64, &["fastest", "astar", "orca"]),
         ("eval run --scheduler nearest", 64, &["nearest", "greedy"]),
         ("eval tiny.toml --scheduler exact", 64, &["tiny.toml", "not weights", "--controller learned", "orca"]),
-        ("eval tiny.toml --controller astar", 64, &["tiny.toml", "pairwise scheduler", "--scheduler exact, greedy"]),
+        (
+            "eval tiny.toml --controller astar",
+            64,
+            &["tiny.toml", "pairwise scheduler", "--scheduler exact, makespan, greedy"],
+        ),
         ("eval tiny.toml --controller astar --scheduler exact --strict", 64, &["--strict", "no weights"]),
         ("eval range.toml --controller astar --scheduler exact", 64, &["range.toml", "mappo.gamma"]),
         ("eval none.toml --controller astar --scheduler exact", 64, &["none.toml does not exist"]),
