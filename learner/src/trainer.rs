@@ -121,7 +121,7 @@ impl Trainer {
         let (metrics, events) = (MetricsFile::create(trainer.disk.clone(), place())?, EventFile::new(place(), None));
         trainer.observe(metrics);
         trainer.observe(events);
-        trainer.observe(SendersFile::open(folder, 0));
+        trainer.observe(SendersFile::open(place(), 0));
         trainer.checkpoint()?;
         Ok(trainer)
     }
@@ -176,7 +176,7 @@ impl Trainer {
             trainer.missing_lines = missing;
             trainer.observe(metrics);
             trainer.observe(events);
-            trainer.observe(SendersFile::open(folder, progress.iteration));
+            trainer.observe(SendersFile::open(place(), progress.iteration));
         }
         let completed = (progress.iteration, progress.joint_env_steps);
         trainer.before = MetricsFile::last_line(folder).and_then(|line| parse_report(line, completed));

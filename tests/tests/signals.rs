@@ -171,19 +171,3 @@ fn few_open_files_are_enough_for_a_training_or_named_at_the_start() {
         fs::remove_dir_all(&out).unwrap();
     }
 }
-
-#[test]
-fn a_run_folder_that_is_removed_ends_the_training_by_name() {
-    for how in ["--in-process", "--actors=1"] {
-        let place = Place::new(1_000_000);
-        let mut training = place.train("run", how);
-        wait_until("iterations", || place.lines("run") > 1);
-        // A kill may hit it between two files.
-        wait_until("the folder to be removed", || fs::remove_dir_all(place.path("run")).is_ok());
-        let code = training.wait().unwrap().code();
-        let log = fs::read_to_string(place.path("run.log")).unwrap();
-        assert_eq!(code, Some(73), "{how}: {log}");
-        assert!(log.contains("/run: the run folder was removed"), "{how}: {log}");
-        assert!(!place.path("run").exists(), "{how}");
-    }
-}

@@ -1,13 +1,14 @@
 //! senders.jsonl: which actor computed which shard that was trained on, one line per iteration. If an actor turns out to compute
 //! wrong results, it tells what they are in. No number of the run depends on it.
 
+use crate::checkpoint::disk::Place;
 use crate::origin::Origin;
 use crate::report::observer::{FileError, RunObserver};
 use magex_core::ids::{Shard, ShardKind};
 use serde::Serialize;
 use std::fs::OpenOptions;
 use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 const FILE: &str = "senders.jsonl";
 
@@ -29,14 +30,18 @@ struct Sent<'a> {
 /// senders.jsonl of a run folder.
 #[derive(Debug)]
 pub(crate) struct SendersFile {
+    place: Place,
     path: PathBuf,
+    /// The file is there. One that another program removes is not made again: its folder may be about to go, too.
+    begun: bool,
     failed: bool,
 }
 
 impl SendersFile {
     /// The file of a run that continues after `iteration` iterations: later lines are removed.
-    pub(crate) fn open(folder: &Path, iteration: u32) -> Self {
-        let mut file = Self { path: folder.join(FILE), failed: false };
+    pub(crate) fn open(place: Place, iteration: u32) -> Self {
+        let path = place.folder().join(FILE);
+        let mut file = Self { begun: path.exists(), path, place, failed: false };
         if let Err(error) = file.cut(iteration) {
             file.complain(&error);
         }
@@ -58,8 +63,11 @@ impl SendersFile {
         OpenOptions::new().write(true).open(&self.path)?.set_len(length as u64)
     }
 
-    fn append(&self, line: &str) -> std::io::Result<()> {
-        OpenOptions::new().append(true).create(true).open(&self.path)?.write_all(line.as_bytes())
+    fn append(&mut self, line: &str) -> std::io::Result<()> {
+        self.place.check()?;
+        let mut file = OpenOptions::new().append(true).create(!self.begun).open(&self.path)?;
+        self.begun = true;
+        file.write_all(line.as_bytes())
     }
 
     /// Training does not depend on the file.
@@ -104,7 +112,7 @@ mod tests {
     fn a_line_per_iteration_is_cut_back_with_the_run() {
         let folder = tempfile::tempdir().unwrap();
         let read = || std::fs::read_to_string(folder.path().join(FILE)).unwrap();
-        let mut file = SendersFile::open(folder.path(), 0);
+        let mut file = SendersFile::open(Place::of(folder.path()), 0);
         let origin = |index: u64| Origin { actor: "a".into(), process: 0xab + index, digest: format!("d{index}") };
         for iteration in 0..3 {
             file.senders(
@@ -119,9 +127,9 @@ mod tests {
         assert_eq!(read().lines().count(), 2);
         // Half a line, as a kill leaves it.
         file.append("{\"iteration\":2,\"sh").unwrap();
-        SendersFile::open(folder.path(), 2);
+        SendersFile::open(Place::of(folder.path()), 2);
         assert_eq!(read().lines().count(), 2);
-        SendersFile::open(folder.path(), 1);
+        SendersFile::open(Place::of(folder.path()), 1);
         assert_eq!(read(), format!("{first}\n"));
     }
 }

@@ -169,6 +169,7 @@ impl Trainer {
             "reason": reason,
         });
         let kept = || -> std::io::Result<()> {
+            self.place.check()?;
             std::fs::create_dir_all(&folder)?;
             if std::fs::read_dir(&folder)?.count() >= 2 * QUARANTINED {
                 return Ok(());
