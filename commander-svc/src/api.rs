@@ -73,7 +73,7 @@ impl CommanderService for CommanderApi {
     async fn assign(&self, request: Request<v1::AssignRequest>) -> Answer<v1::AssignResponse> {
         caller(&request, CLIENT)?;
         let budget = budget(&request);
-        let problem = Problem::read(request.into_inner(), self.answering.seed(), &self.limits).map_err(to_status)?;
+        let problem = self.answering.read(request.into_inner(), &self.limits).map_err(to_status)?;
         self.answering.respond(problem, budget).await.map(Response::new)
     }
 
@@ -86,7 +86,7 @@ impl CommanderService for CommanderApi {
             return Err(status::invalid_argument("teams", problem));
         }
         let read = |(k, team)| {
-            let problem = Problem::read(team, self.answering.seed(), &self.limits);
+            let problem = self.answering.read(team, &self.limits);
             problem.map_err(|error| to_status(error.within(&format!("teams[{k}]"))))
         };
         let problems: Vec<Problem> = teams.into_iter().enumerate().map(read).collect::<Result<_, _>>()?;

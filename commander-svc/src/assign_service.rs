@@ -10,7 +10,9 @@ use crate::metrics::CommanderMetrics;
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply};
 use magex_dispatch::answer::Planned;
-use magex_dispatch::{AssignError, Problem, engine};
+use magex_dispatch::{AssignError, Limits, Problem, engine};
+use magex_proto::apart::apart;
+use magex_proto::convert::ConvertError;
 use magex_proto::v1;
 use magex_runtime::backoff::random_id;
 use magex_runtime::status;
@@ -64,9 +66,11 @@ impl AssignService {
         Arc::new(Self { store, metrics, processors, memory, model_nanos, next_seed })
     }
 
-    /// A seed for a request without one.
-    pub(crate) fn seed(&self) -> u64 {
-        self.next_seed.fetch_add(1, Ordering::Relaxed)
+    /// Checks a team on the wire. A long one is read while other calls of this thread run on another.
+    pub(crate) fn read(&self, team: v1::AssignRequest, limits: &Limits) -> Result<Problem, ConvertError> {
+        // The seed of a request without one.
+        let seed = self.next_seed.fetch_add(1, Ordering::Relaxed);
+        apart(bytes(&team), || Problem::read(team, seed, limits))
     }
 
     /// Answers a team on the wire.
@@ -209,6 +213,13 @@ impl AssignService {
         let weights = (key.version.0, key.sha256.clone(), key.run_id.0.clone());
         Ok(Planned { plan, fallback_reason: String::new(), weights: Some(weights) })
     }
+}
+
+/// Roughly how long a team was on the wire.
+fn bytes(team: &v1::AssignRequest) -> usize {
+    let costs = team.costs.as_ref().map_or(0, |costs| 8 * costs.values.len());
+    let pairs = team.cost_overrides.len() + team.forbidden.len() + team.current.len();
+    costs + 16 * (pairs + team.agent_ids.len() + team.goal_ids.len())
 }
 
 const MODEL_FAILED: &str = "the model failed with an internal error";

@@ -7,7 +7,7 @@ use crate::error::to_status;
 use crate::training_view::{TrainingShard, TrainingView};
 use magex_dispatch::answer::Planned;
 use magex_dispatch::clock::Now;
-use magex_dispatch::mission::Mission;
+use magex_dispatch::mission::{Mission, places};
 use magex_dispatch::missions::{KeepError, Missions, passes};
 use magex_dispatch::{AssignError, Problem};
 use magex_proto::v1;
@@ -70,7 +70,7 @@ impl MissionService {
         request: v1::CreateMissionRequest,
         budget: CallBudget,
     ) -> Result<v1::Assignment, Status> {
-        let cells = self.cells((0, 0), (request.agents.len(), request.goals.len()), learned(request.scheduler));
+        let cells = self.cells((0, 0), (request.agents.len(), places(&request.goals)), learned(request.scheduler));
         let (own, places) = (self.clone(), self.answering.places(cells, budget.left()).await?);
         on_thread(places, budget, move |work| {
             own.missions.check_room(&caller.name).map_err(to_status)?;
@@ -250,7 +250,7 @@ impl MissionService {
 
     fn most_cells(&self, before: &Mission, request: &v1::UpdateMissionRequest) -> usize {
         let learned = learned(before.assignment.scheduler) || learned(request.scheduler);
-        self.cells(before.size(), (request.agents.len(), request.goals.len()), learned)
+        self.cells(before.size(), (request.agents.len(), places(&request.goals)), learned)
     }
 
     fn planner(&self, work: &Work) -> impl Fn(&Problem) -> Result<Planned, AssignError> {

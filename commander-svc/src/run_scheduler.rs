@@ -10,6 +10,9 @@ use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::convert::ConvertError;
 use std::sync::Arc;
 
+/// Largest coordinate that a network sees as it is: single precision holds a thousandth of a unit.
+const LARGEST_AS_IT_IS: f64 = 8192.0;
+
 /// The scheduler of one version of the weights.
 #[derive(Debug)]
 pub struct RunScheduler {
@@ -22,7 +25,7 @@ pub struct RunScheduler {
 pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn Scheduler>, SchedulerError> {
     let config = RunConfig::from_toml(run_config_toml).map_err(|error| SchedulerError::Load(error.to_string()))?;
     let commander = match Commander::classical(config.commander.kind) {
-        Some(classical) => classical,
+        Some(classical) => classical.with_power(config.commander.power),
         None => Commander::load(&config.commander, config.task.agents, config.task.dims(), weights)
             .map_err(|error| SchedulerError::Load(error.to_string()))?,
     };
@@ -47,6 +50,7 @@ impl Scheduler for RunScheduler {
     fn method(&self) -> AssignmentMethod {
         match self.commander.kind() {
             CommanderPolicy::Exact => AssignmentMethod::Exact,
+            CommanderPolicy::Makespan => AssignmentMethod::Makespan,
             CommanderPolicy::Greedy => AssignmentMethod::Greedy,
             CommanderPolicy::Random => AssignmentMethod::Random,
             CommanderPolicy::Pairwise | CommanderPolicy::Ranking => AssignmentMethod::Learned,
@@ -57,7 +61,8 @@ impl Scheduler for RunScheduler {
         if self.method() != AssignmentMethod::Learned {
             return Err(SchedulerError::Unsupported("the run has no learned scheduler".to_owned()));
         }
-        let team = Team { agents: &problem.agents, goals: &problem.goals, dims: problem.dims };
+        let (agents, goals) = in_single(problem, self.commander.kind() == CommanderPolicy::Pairwise);
+        let team = Team { agents: &agents, goals: &goals, dims: problem.dims };
         let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
         let decision = self
             .commander
@@ -66,4 +71,22 @@ impl Scheduler for RunScheduler {
         let goals = decision.goals.into_iter().map(|goal| (goal != UNASSIGNED).then_some(goal)).collect();
         Ok(TeamReply { goals, probabilities: Some(decision.probabilities) })
     }
+}
+
+/// The positions `[N, D]` and `[G, D]` in the single precision of networks. `movable`: the network looks at distances only, so that
+/// large coordinates may lose their common part first, and keep their digits.
+fn in_single(problem: &Problem, movable: bool) -> (Vec<f32>, Vec<f32>) {
+    let all = || problem.agents.iter().chain(&problem.goals);
+    let fits = all().all(|x| x.abs() <= LARGEST_AS_IT_IS);
+    let origin: Vec<f64> = (0..problem.dims)
+        .map(|axis| {
+            if movable && !fits {
+                all().skip(axis).step_by(problem.dims).copied().fold(f64::INFINITY, f64::min)
+            } else {
+                0.0
+            }
+        })
+        .collect();
+    let single = |points: &[f64]| points.iter().zip(origin.iter().cycle()).map(|(x, from)| (x - from) as f32).collect();
+    (single(&problem.agents), single(&problem.goals))
 }

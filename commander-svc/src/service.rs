@@ -37,6 +37,8 @@ const NOTE: u64 = 30;
 /// Bytes of requests in flight: of one caller, and of all callers.
 const CALLER_BYTES: usize = 64 << 20;
 const BYTES: usize = 256 << 20;
+/// What to do about a message beyond --max-message.
+const TOO_LONG: &str = "raise --max-message (MiB), or send positions or sparse_costs in place of a cost matrix";
 /// Name of the file with the missions.
 const MISSIONS: &str = "missions.redb";
 
@@ -177,6 +179,7 @@ pub async fn run_and_tell(
         in_flight: in_flight.clone(),
         streams: STREAMS,
         message_bytes: config.message_bytes,
+        too_long: Some(TOO_LONG),
         calls: Some(metrics.calls.clone()),
     };
     let internal =

@@ -4,9 +4,9 @@ use crate::assign_service::AssignService;
 use crate::call_budget::CallBudget;
 use crate::error::to_status;
 use crate::mission_service::{Event, MissionService, visible};
+use magex_dispatch::Limits;
 use magex_dispatch::clock::Now;
 use magex_dispatch::missions::passes;
-use magex_dispatch::{Limits, Problem};
 use magex_proto::v1;
 use magex_runtime::net::auth::Caller;
 use magex_runtime::net::heartbeat::Heartbeat;
@@ -84,7 +84,7 @@ async fn one(
     budget: CallBudget,
 ) -> Result<v1::AssignResponse, Status> {
     let team = team.ok_or_else(|| status::invalid_argument("team", "missing"))?;
-    let problem = Problem::read(team, answering.seed(), limits).map_err(|error| to_status(error.within("team")))?;
+    let problem = answering.read(team, limits).map_err(|error| to_status(error.within("team")))?;
     answering.respond(problem, budget).await
 }
 

@@ -67,8 +67,10 @@ impl TrainingShard {
     pub(crate) fn assignment(&self, place: usize) -> Option<v1::Assignment> {
         let (request, reply) = (&*self.request, &self.reply);
         let (n, g, d) = (request.agent_count, request.goal_count, request.dims);
-        let points =
-            |values: &[f32], count: usize| Some(values.get(place * count * d..(place + 1) * count * d)?.to_vec());
+        let points = |values: &[f32], count: usize| -> Option<Vec<f64>> {
+            let own = values.get(place * count * d..(place + 1) * count * d)?;
+            Some(own.iter().copied().map(f64::from).collect())
+        };
         let named = |side: &str, count: usize| (0..count).map(|k| format!("{side}-{k}")).collect();
         let problem = Problem {
             agent_ids: named("agent", n),
@@ -79,20 +81,23 @@ impl TrainingShard {
         if pairs(&goal_of).any(|(_, goal)| goal >= g) {
             return None;
         }
-        let mut pair_costs = vec![0.0; n];
-        pairs(&goal_of).for_each(|(agent, goal)| pair_costs[agent] = problem.distance(agent, goal));
         let plan = Plan {
+            pairs: problem.pair_terms(&goal_of),
             goal_of,
             scheduler: self.method,
             cost: f64::from(*reply.costs.get(place)?),
             exact_cost: Some(f64::from(*reply.exact_costs.get(place)?)),
-            pair_costs,
             ..Plan::default()
         };
         let answer = answer::write(&problem, &plan);
-        let members = |ids: Vec<String>, positions: &[f32]| {
+        let members = |ids: Vec<String>, positions: &[f64]| {
             let state = v1::MemberState::Active.into();
-            let member = |(id, position): (String, &[f32])| v1::Member { id, position: position.to_vec(), state };
+            let member = |(id, position): (String, &[f64])| v1::Member {
+                id,
+                position: position.to_vec(),
+                state,
+                ..Default::default()
+            };
             ids.into_iter().zip(positions.chunks_exact(d.max(1))).map(member).collect()
         };
         let (part, episode) = self.part_and_episode(place);
@@ -102,6 +107,7 @@ impl TrainingShard {
             title: format!("{part} episode {episode} of run {run_id}"),
             source: v1::MissionSource::Training.into(),
             revision: 1,
+            power: 1.0,
             agents: members(problem.agent_ids, &problem.agents),
             goals: members(problem.goal_ids, &problem.goals),
             pairs: answer.pairs,

@@ -147,12 +147,12 @@ const FILES: [&str; 3] = ["weights.safetensors", "optimiser.safetensors", "state
 
 /// Writes a checkpoint below `run/checkpoints` and removes the oldest beyond `keep`. Returns its folder.
 pub fn write(run: &Path, progress: &Progress, learned: &Learned, keep: u32) -> Result<PathBuf, CheckpointError> {
-    write_on(&mut FileSystem, run, progress, learned, keep)
+    write_on(&FileSystem, run, progress, learned, keep)
 }
 
 /// [`write()`] on a disk of the caller's.
 pub fn write_on(
-    disk: &mut dyn Disk,
+    disk: &dyn Disk,
     run: &Path,
     progress: &Progress,
     learned: &Learned,
@@ -163,7 +163,7 @@ pub fn write_on(
 
 /// [`write_on`] that also keeps the newest checkpoint of an iteration up to `back_to`, which a return may need.
 pub(crate) fn write_keeping(
-    disk: &mut dyn Disk,
+    disk: &dyn Disk,
     run: &Path,
     progress: &Progress,
     learned: &Learned,
@@ -175,6 +175,7 @@ pub(crate) fn write_keeping(
     if let Some(replay) = &learned.replay {
         replay::write(disk, run, replay)?;
     }
+    disk.create_dir(&parent).map_err(in_file(&parent))?;
     if let Err(error) = fill(disk, &temporary, progress, learned) {
         // Half a checkpoint is of no use and takes room, which may be what is missing.
         let _ = disk.remove_dir(&temporary);
@@ -190,8 +191,9 @@ pub(crate) fn write_keeping(
         disk.rename(&folder, &replaced).map_err(in_file(&folder))?;
     }
     disk.rename(&temporary, &folder).map_err(in_file(&folder))?;
-    // The renames must survive a power cut before anything older goes.
+    // The renames must survive a power cut before anything older goes, and with the first one the folder that they are in.
     disk.sync(&parent).map_err(in_file(&parent))?;
+    disk.sync(run).map_err(in_file(run))?;
     let needed = back_to.and_then(|iteration| up_to(run, iteration).pop());
     let newest_first = list(run).into_iter().rev();
     let old = newest_first.skip(keep.max(1) as usize).filter(|old| Some(old) != needed.as_ref());
@@ -204,13 +206,13 @@ pub(crate) fn write_keeping(
     }
     if let Some(replay) = &learned.replay {
         let oldest = list(run).first().and_then(|folder| numbered(folder.clone())).map_or(0, |(number, ..)| number);
-        replay::remove(run, |iteration| u64::from(iteration) + (replay.block_count() as u64) < oldest);
+        replay::remove(disk, run, |iteration| u64::from(iteration) + (replay.block_count() as u64) < oldest);
     }
     Ok(folder)
 }
 
 /// Everything that a checkpoint consists of, under its temporary name, safe from a power cut.
-fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
+fn fill(disk: &dyn Disk, folder: &Path, progress: &Progress, learned: &Learned) -> Result<(), CheckpointError> {
     if folder.exists() {
         disk.remove_dir(folder).map_err(in_file(folder))?;
     }
@@ -238,11 +240,11 @@ fn fill(disk: &mut dyn Disk, folder: &Path, progress: &Progress, learned: &Learn
 
 /// Removes what a kill left of checkpoints that were being written, and the episodes of iterations from `iteration` on, which will
 /// be collected again. No other process may be writing.
-pub fn clean(run: &Path, iteration: u32) {
-    replay::remove(run, |other| other >= iteration);
+pub fn clean(disk: &dyn Disk, run: &Path, iteration: u32) {
+    replay::remove(disk, run, |other| other >= iteration);
     let entries = fs::read_dir(run.join("checkpoints")).into_iter().flatten().filter_map(Result::ok);
     for path in entries.map(|entry| entry.path()).filter(|path| hidden(path, ".tmp").is_some()) {
-        if let Err(error) = fs::remove_dir_all(&path) {
+        if let Err(error) = disk.remove_dir(&path) {
             // It only takes room.
             tracing::warn!(%error, path = %path.display(), "an unfinished checkpoint cannot be removed");
         }
@@ -284,7 +286,7 @@ pub(crate) fn go_back(run: &Path, iteration: u32, template: &Learned) -> Option<
             tracing::error!(%error, path = %newer.display(), "a checkpoint that must not be used cannot be removed; remove it");
         }
     }
-    clean(run, found.0.iteration);
+    clean(&FileSystem, run, found.0.iteration);
     Some(found)
 }
 

@@ -1,6 +1,7 @@
 //! The learner's command line.
 
 use crate::checkpoint;
+use crate::run_events::StopReason;
 use crate::run_folder::{CONFIG_FILE, Claim, FolderError, RunFolderState};
 use crate::run_identity::RunIdentity;
 use crate::run_start::Parent;
@@ -21,13 +22,20 @@ use magex_runtime::process;
 use magex_runtime::security::{Security, ServerArgs};
 use magex_runtime::service::{self, Context, ServiceArgs};
 use magex_viewer::page::{LivePage, RunInfo};
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio_util::sync::CancellationToken;
 
 /// How long the trainer may take to end its iteration after a shutdown. The process may exit at any moment without damage to
 /// its checkpoints.
 const STOP_BUDGET: Duration = Duration::from_secs(8);
+
+/// How often a run that continues looks whether its disk takes writes again.
+const DISK_RETRY: Duration = Duration::from_secs(1);
+/// What a disk says that may take writes later.
+const PASSING: [ErrorKind; 3] = [ErrorKind::ReadOnlyFilesystem, ErrorKind::StorageFull, ErrorKind::QuotaExceeded];
 
 /// Differentiation recurses through the graph.
 const TRAINER_STACK: usize = 64 << 20;
@@ -140,7 +148,9 @@ async fn train(
     // Bound first: a port that is not available must not leave a run folder behind.
     let (incoming, address) = context.listen(&args.listen, args.security.connections()).await?;
     let stop = context.stop.clone();
-    let (claim, mut trainer) = prepare(args, &config, &toml, parent.as_ref())?;
+    let Some((claim, mut trainer)) = prepared(&stop, || prepare(args, &config, &toml, parent.as_ref())).await? else {
+        return Ok(Some(TrainOutcome::Stopped(StopReason::Shutdown)));
+    };
     let claim = Arc::new(claim);
     let (stopped, claimed, begun) = (stop.clone(), claim.clone(), claim.clone());
     tokio::spawn(async move {
@@ -270,17 +280,62 @@ fn failed(error: TrainError) -> Failure {
     Failure::new(code, error)
 }
 
+/// Why there is no trainer.
+struct Unprepared {
+    failure: Failure,
+    /// The disk of a run that continues takes no writes for now.
+    passing: bool,
+}
+
+impl From<Failure> for Unprepared {
+    fn from(failure: Failure) -> Self {
+        Self { failure, passing: false }
+    }
+}
+
+/// What `prepare` prepares. A run that continues waits for its disk, as one does that trains: a restart policy would only repeat
+/// the attempt. `None` if a stop is requested meanwhile.
+async fn prepared<T>(
+    stop: &CancellationToken,
+    mut prepare: impl FnMut() -> Result<T, Unprepared>,
+) -> Result<Option<T>, Failure> {
+    let mut waited = false;
+    loop {
+        match prepare() {
+            Ok(prepared) => {
+                if waited {
+                    tracing::info!("the run folder can be written again");
+                }
+                return Ok(Some(prepared));
+            }
+            Err(Unprepared { failure, passing: true }) => {
+                if !waited {
+                    tracing::error!(error = %failure, "the run folder cannot be written; waiting until it can");
+                }
+                waited = true;
+            }
+            Err(Unprepared { failure, .. }) => return Err(failure),
+        }
+        if stop.run_until_cancelled(tokio::time::sleep(DISK_RETRY)).await.is_none() {
+            return Ok(None);
+        }
+    }
+}
+
 /// Locks the run folder, and creates the run or opens its newest usable checkpoint.
 fn prepare(
     args: &LearnerArgs,
     config: &RunConfig,
     toml: &str,
     parent: Option<&Parent>,
-) -> Result<(Claim, Trainer), Failure> {
+) -> Result<(Claim, Trainer), Unprepared> {
     let unusable = |error: FolderError| Failure::new(exit::CANNOT_CREATE, format!("--out {error}"));
+    let passing = |error: Option<&std::io::Error>| error.is_some_and(|error| PASSING.contains(&error.kind()));
     if args.resume && RunFolderState::of(&args.out) != RunFolderState::Begun {
-        let claim = Claim::resume(&args.out, COMMAND, args.lock_descriptor).map_err(unusable)?;
-        let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads).map_err(failed)?;
+        let claim = Claim::resume(&args.out, COMMAND, args.lock_descriptor)
+            .map_err(|error| Unprepared { passing: passing(error.io()), failure: unusable(error) })?;
+        let (trainer, skipped) = Trainer::resume(config, &args.out, args.threads)
+            .map_err(|error| Unprepared { passing: passing(error.io()), failure: failed(error) })?;
         for problem in skipped {
             tracing::warn!(error = %problem, "skipped a checkpoint");
         }
@@ -292,7 +347,7 @@ fn prepare(
         Ok(trainer) => Ok((claim, trainer)),
         Err(error) => {
             claim.abandon();
-            Err(if error.is_output() { Failure::new(exit::CANNOT_CREATE, error) } else { failed(error) })
+            Err(if error.is_output() { Failure::new(exit::CANNOT_CREATE, error) } else { failed(error) }.into())
         }
     }
 }

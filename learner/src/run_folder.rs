@@ -1,7 +1,7 @@
 //! Run folders: what is in one, and the process that begins or continues a run in it.
 
 use crate::checkpoint;
-use crate::checkpoint::disk::{FileSystem, replace_file};
+use crate::checkpoint::disk::{Disk, FileSystem, replace_file};
 use crate::run_lock::{LOCK_FILE, LockError, RunLock};
 use std::fs;
 use std::io::ErrorKind;
@@ -71,6 +71,16 @@ pub enum FolderError {
     Lock(#[from] LockError),
 }
 
+impl FolderError {
+    /// What the system says, if a file or folder cannot be used.
+    pub fn io(&self) -> Option<&std::io::Error> {
+        match self {
+            Self::Io(_, error) | Self::Lock(LockError::File { error, .. }) => Some(error),
+            _ => None,
+        }
+    }
+}
+
 fn remedy(state: RunFolderState) -> &'static str {
     match state {
         RunFolderState::Run | RunFolderState::Begun => {
@@ -97,6 +107,14 @@ impl Claim {
     /// # Errors
     /// Something else is there, another process writes to it, or it cannot be written.
     pub fn begin(out: &Path, toml: &str, command: &str, again: bool) -> Result<Self, FolderError> {
+        Self::begin_on(&FileSystem, out, toml, command, again)
+    }
+
+    /// [`Self::begin`] on a disk of the caller's.
+    ///
+    /// # Errors
+    /// As those of `begin`.
+    pub fn begin_on(disk: &dyn Disk, out: &Path, toml: &str, command: &str, again: bool) -> Result<Self, FolderError> {
         let refused = || match RunFolderState::of(out) {
             RunFolderState::Empty => None,
             RunFolderState::Begun if again => None,
@@ -113,7 +131,7 @@ impl Claim {
         }
         let made: Vec<PathBuf> = out.ancestors().take_while(|path| !path.exists()).map(Path::to_owned).collect();
         let io = |error| FolderError::Io(out.to_owned(), error);
-        let mut claim = fs::create_dir_all(out).map_err(io).and_then(|()| {
+        let mut claim = create(disk, &made).map_err(io).and_then(|()| {
             let lock = RunLock::acquire(out, command)?;
             Ok(Self { lock, folder: out.to_owned(), made: None })
         })?;
@@ -125,7 +143,7 @@ impl Claim {
             RunFolderState::Empty => claim.made = Some(made),
             _ => tracing::info!("nothing has been trained in this folder; beginning again"),
         }
-        match replace_file(&mut FileSystem, out, CONFIG_FILE, toml.as_bytes()) {
+        match replace_file(disk, out, CONFIG_FILE, toml.as_bytes()) {
             Ok(()) => Ok(claim),
             Err(error) => {
                 claim.abandon();
@@ -163,6 +181,16 @@ impl Claim {
         // Fails where something else is in it.
         made.iter().for_each(|path| drop(fs::remove_dir(path)));
     }
+}
+
+/// Makes folders, the deepest of which comes first, so that they survive a power cut.
+fn create(disk: &dyn Disk, folders: &[PathBuf]) -> std::io::Result<()> {
+    for folder in folders.iter().rev().filter(|folder| !folder.as_os_str().is_empty()) {
+        disk.create_dir(folder)?;
+        let above = folder.parent().filter(|above| !above.as_os_str().is_empty());
+        disk.sync(above.unwrap_or(Path::new(".")))?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -12,12 +12,12 @@ use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
 
-use crate::checkpoint::disk::{FileSystem, replace_file};
+use crate::checkpoint::disk::{Disk, FileSystem, Place, replace_file};
 use crate::checkpoint::{self, CheckpointError, Progress};
 use crate::collector::Collector;
 use crate::origin::Origin;
 use crate::report::means::{EvalSummary, IterationMeans, summarise};
-use crate::report::metrics_file::MetricsFile;
+use crate::report::metrics_file::{MetricsFile, ranges};
 use crate::report::observer::{FileError, RunObserver, RunStart};
 use crate::report::records::{IterationMetrics, Summary, Timing};
 use crate::report::senders::SendersFile;
@@ -40,8 +40,7 @@ use magex_proto::v1::{FinishedEvent, IterationEvent};
 use magex_proto::weights::Weights;
 use magex_runtime::trace;
 use magex_viewer::page::{Phase, RunEnd};
-use std::os::unix::fs::MetadataExt as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 use trust::Collected;
@@ -56,9 +55,9 @@ const SUMMARY_FILE: &str = "summary.json";
 pub struct Trainer {
     config: RunConfig,
     run_id: RunId,
-    folder: PathBuf,
-    /// Which folder that was at the start.
-    place: Option<(u64, u64)>,
+    disk: Arc<dyn Disk>,
+    /// The run folder.
+    place: Place,
     algorithm: Algorithm,
     commander: CommanderPpo,
     learned: Learned,
@@ -70,6 +69,8 @@ pub struct Trainer {
     /// The summary of a run that was complete when it was opened, parsed and as it is on disk.
     complete: Option<(Summary, String)>,
     before: Option<IterationEvent>,
+    /// Iterations that were trained and have no line in metrics.jsonl.
+    missing_lines: Vec<u32>,
     /// Checkpoints that could not be written, in a row.
     failed_checkpoints: u32,
     /// Updates that failed because of their results, in a row.
@@ -95,14 +96,31 @@ impl Trainer {
         folder: &Path,
         threads: usize,
     ) -> Result<Self, TrainError> {
-        let mut trainer = Self::prepare(config, run_id, folder, threads)?;
+        Self::create_on(Arc::new(FileSystem), parent, config, run_id, folder, threads)
+    }
+
+    /// [`Self::create_from`] on a disk of the caller's.
+    ///
+    /// # Errors
+    /// As those of `create_from`.
+    pub fn create_on(
+        disk: Arc<dyn Disk>,
+        parent: Option<&Parent>,
+        config: &RunConfig,
+        run_id: RunId,
+        folder: &Path,
+        threads: usize,
+    ) -> Result<Self, TrainError> {
+        let mut trainer = Self::prepare(disk, config, run_id, folder, threads)?;
         match parent {
             Some(parent) => parent.begin(config, &mut trainer.learned)?,
             None if config.run.initial_weights.is_empty() => {}
             None => return Err(TrainError::NoParent(config.run.initial_weights.clone())),
         }
-        trainer.observe(MetricsFile::create(folder)?);
-        trainer.observe(EventFile::new(folder, None));
+        let place = || trainer.place.clone();
+        let (metrics, events) = (MetricsFile::create(trainer.disk.clone(), place())?, EventFile::new(place(), None));
+        trainer.observe(metrics);
+        trainer.observe(events);
         trainer.observe(SendersFile::open(folder, 0));
         trainer.checkpoint()?;
         Ok(trainer)
@@ -118,22 +136,46 @@ impl Trainer {
         folder: &Path,
         threads: usize,
     ) -> Result<(Self, Vec<CheckpointError>), TrainError> {
+        Self::resume_on(Arc::new(FileSystem), config, folder, threads)
+    }
+
+    /// [`Self::resume`] on a disk of the caller's.
+    ///
+    /// # Errors
+    /// As those of `resume`.
+    pub fn resume_on(
+        disk: Arc<dyn Disk>,
+        config: &RunConfig,
+        folder: &Path,
+        threads: usize,
+    ) -> Result<(Self, Vec<CheckpointError>), TrainError> {
         let (config, changes) = continued(folder, config)?;
         if let Some(forbidden) = changes.forbidden() {
             return Err(TrainError::OtherConfiguration(folder.to_owned(), forbidden));
         }
-        let mut trainer = Self::prepare(&config, RunId(String::new()), folder, threads)?;
+        let mut trainer = Self::prepare(disk, &config, RunId(String::new()), folder, threads)?;
         let (mut progress, learned, skipped) = checkpoint::read_latest(folder, &trainer.learned)?;
         trainer.run_id = RunId(progress.run_id.clone());
-        checkpoint::clean(folder, progress.iteration);
+        checkpoint::clean(&*trainer.disk, folder, progress.iteration);
         if changes.is_empty() {
             trainer.complete = summary_of(folder, progress.iteration, &learned)?;
         } else {
             trainer.change(&changes, &mut progress)?;
         }
         if trainer.complete.is_none() {
-            trainer.observe(MetricsFile::reopen(folder, progress.iteration)?);
-            trainer.observe(EventFile::new(folder, Some(progress.joint_env_steps)));
+            let place = || trainer.place.clone();
+            let (metrics, missing) = MetricsFile::reopen(trainer.disk.clone(), place(), progress.iteration)?;
+            let events = EventFile::new(place(), Some(progress.joint_env_steps));
+            if !missing.is_empty() {
+                let iterations = ranges(&missing);
+                tracing::warn!(
+                    iterations,
+                    "metrics.jsonl has no lines of these iterations; they were trained all the same"
+                );
+            }
+            trainer.missing_lines = missing;
+            trainer.observe(metrics);
+            trainer.observe(events);
             trainer.observe(SendersFile::open(folder, progress.iteration));
         }
         let completed = (progress.iteration, progress.joint_env_steps);
@@ -161,21 +203,27 @@ impl Trainer {
         }
         (progress.config_sha256, progress.config) = (self.progress.config_sha256.clone(), self.progress.config.clone());
         let failed = |name: &str| {
-            let path = self.folder.join(name);
+            let path = self.place.folder().join(name);
             move |error| FileError { path, error }
         };
         // In this order: a kill in between leaves a run that is not complete.
-        match std::fs::remove_file(self.folder.join(SUMMARY_FILE)) {
+        match self.disk.remove_file(&self.place.folder().join(SUMMARY_FILE)) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(failed(SUMMARY_FILE)(error).into());
             }
             _ => {}
         }
         let toml = self.progress.config.as_bytes();
-        Ok(replace_file(&mut FileSystem, &self.folder, CONFIG_FILE, toml).map_err(failed(CONFIG_FILE))?)
+        Ok(replace_file(&*self.disk, self.place.folder(), CONFIG_FILE, toml).map_err(failed(CONFIG_FILE))?)
     }
 
-    fn prepare(config: &RunConfig, run_id: RunId, folder: &Path, threads: usize) -> Result<Self, TrainError> {
+    fn prepare(
+        disk: Arc<dyn Disk>,
+        config: &RunConfig,
+        run_id: RunId,
+        folder: &Path,
+        threads: usize,
+    ) -> Result<Self, TrainError> {
         check_buffer(config)?;
         let algorithm = Algorithm::new(config)?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
@@ -195,8 +243,8 @@ impl Trainer {
         Ok(Self {
             config: config.clone(),
             run_id,
-            folder: folder.to_owned(),
-            place: identity(folder),
+            disk,
+            place: Place::of(folder),
             algorithm,
             commander,
             learned,
@@ -206,6 +254,7 @@ impl Trainer {
             pool: Arc::new(pool),
             complete: None,
             before: None,
+            missing_lines: Vec::new(),
             failed_checkpoints: 0,
             refused: 0,
             unconfirmed_since: None,
@@ -222,9 +271,14 @@ impl Trainer {
         &self.learned
     }
 
+    /// Iterations of the checkpoint that have no line in metrics.jsonl, in order: another program removed them.
+    pub fn missing_lines(&self) -> &[u32] {
+        &self.missing_lines
+    }
+
     /// Adds an observer, after those that are there.
     pub fn observe(&mut self, mut observer: impl RunObserver + 'static) {
-        observer.begin(RunStart { run_id: &self.run_id, folder: &self.folder, before: self.before.as_ref() });
+        observer.begin(RunStart { run_id: &self.run_id, folder: self.place.folder(), before: self.before.as_ref() });
         self.observers.push(Box::new(observer));
     }
 
@@ -325,7 +379,6 @@ impl Trainer {
             self.progress.iteration += 1;
             self.progress.joint_env_steps += self.config.steps_per_iteration();
 
-            self.is_there()?;
             let clock = Instant::now();
             let stop = collector.stop_requested();
             let due = self.progress.iteration.is_multiple_of(self.config.run.checkpoint_every);
@@ -428,11 +481,6 @@ impl Trainer {
         Ok(())
     }
 
-    /// A checkpoint in a folder that was removed would make one without the other files of a run.
-    fn is_there(&self) -> Result<(), TrainError> {
-        if identity(&self.folder) == self.place { Ok(()) } else { Err(TrainError::Gone(self.folder.clone())) }
-    }
-
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
     }
@@ -469,11 +517,6 @@ fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
             built => return built.map_err(|error| TrainError::Threads(error.to_string())),
         }
     }
-}
-
-/// Which folder this is, whatever its name.
-fn identity(folder: &Path) -> Option<(u64, u64)> {
-    std::fs::metadata(folder).ok().map(|meta| (meta.dev(), meta.ino()))
 }
 
 /// Training results and evaluations, each in the order of the plan.

@@ -9,6 +9,11 @@ pub fn from_f32(shape: &[usize], values: &[f32]) -> Array {
     array(DataType::F32, shape, bytes(values, f32::to_le_bytes))
 }
 
+/// An f64 array of the given shape.
+pub fn from_f64(shape: &[usize], values: &[f64]) -> Array {
+    array(DataType::F64, shape, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+}
+
 /// A u32 array of the given shape.
 pub fn from_u32(shape: &[usize], values: &[u32]) -> Array {
     array(DataType::U32, shape, bytes(values, u32::to_le_bytes))
@@ -23,6 +28,15 @@ pub fn from_u8(shape: &[usize], values: &[u8]) -> Array {
 pub fn to_f32(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f32>, FieldError> {
     let data = checked(field, array, DataType::F32, shape, 4)?;
     Ok(data.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect())
+}
+
+/// The numbers of an f64 array, or of an f32 array, that must have exactly this shape.
+pub fn to_f64(field: &str, array: Option<Array>, shape: &[usize]) -> Result<Vec<f64>, FieldError> {
+    if array.as_ref().is_some_and(|array| array.r#type() == DataType::F32) {
+        return Ok(to_f32(field, array, shape)?.into_iter().map(f64::from).collect());
+    }
+    let data = checked(field, array, DataType::F64, shape, 8)?;
+    Ok(data.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
 }
 
 /// The numbers of a u32 array that must have exactly this shape.

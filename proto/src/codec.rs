@@ -4,6 +4,7 @@
 //! the seed. The checksum is a field (the highest that protobuf has) behind the last one of every message. Programs that
 //! do not know it skip it as an unknown field, and messages without it are accepted as they are.
 
+use crate::apart::apart;
 use crate::elements;
 use bytes::{Buf as _, BufMut as _, Bytes};
 use prost::Message;
@@ -89,16 +90,21 @@ impl<T, U: Message + Default + Sent + 'static> Decoder for CheckedCodec<T, U> {
     type Error = Status;
 
     fn decode(&mut self, frame: &mut DecodeBuf<'_>) -> Result<Option<U>, Status> {
-        let bytes = checked(frame.copy_to_bytes(frame.remaining()))?;
-        if !U::BY_CALLER {
-            return U::decode(bytes).map(Some).map_err(|error| Status::internal(error.to_string()));
-        }
-        elements::check::<U>(&bytes).map_err(|limit| {
-            let problem = format!("more than the {limit} elements that a request of this length may have; send fewer");
-            invalid("request", problem)
-        })?;
-        U::decode(bytes).map(Some).map_err(|error| unreadable(&error.to_string()))
+        let bytes = frame.copy_to_bytes(frame.remaining());
+        apart(bytes.len(), || read(bytes)).map(Some)
     }
+}
+
+fn read<U: Message + Default + Sent + 'static>(bytes: Bytes) -> Result<U, Status> {
+    let bytes = checked(bytes)?;
+    if !U::BY_CALLER {
+        return U::decode(bytes).map_err(|error| Status::internal(error.to_string()));
+    }
+    elements::check::<U>(&bytes).map_err(|limit| {
+        let problem = format!("more than the {limit} elements that a request of this length may have; send fewer");
+        invalid("request", problem)
+    })?;
+    U::decode(bytes).map_err(|error| unreadable(&error.to_string()))
 }
 
 fn invalid(field: &str, problem: String) -> Status {

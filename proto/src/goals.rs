@@ -9,9 +9,9 @@ use magex_core::ids::{RunId, Shard, WeightsVersion};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum AssignmentMethod {
     /// The trained scheduler of a run.
-    #[default]
     Learned,
     /// The smallest summed cost.
+    #[default]
     Exact,
     /// The cheapest remaining pair, repeatedly.
     Greedy,

@@ -2,6 +2,7 @@
 //!
 //! Arrays travel as little-endian bytes. Results and weights are cut into parts, far below [`MAX_MESSAGE_BYTES`].
 
+pub mod apart;
 pub mod arrays;
 pub mod codec;
 pub mod convert;

@@ -6,4 +6,5 @@
 pub mod dispatch;
 pub mod files;
 pub mod mutate;
+pub mod run_folder;
 pub mod wire;

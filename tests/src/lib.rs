@@ -3,9 +3,13 @@
 #![allow(clippy::expect_used, clippy::panic, reason = "tests stop where something is not as it should be")]
 
 pub mod decoders;
+pub mod forgetful;
 pub mod proxy;
+pub mod raw;
 pub mod relay;
 pub mod sandbox;
+pub mod small_disk;
+pub mod wall;
 
 use magex::local::LocalCollector;
 use magex_core::config::{ExecutorKind, RunConfig};

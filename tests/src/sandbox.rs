@@ -15,10 +15,14 @@ use std::time::{Duration, Instant};
 /// Longer than anything takes that is going to happen at all.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
-/// The `magex` program of this build; built first if only this package was.
+/// The `magex` program of this build; built first if only this package was. `MAGEX_BINARY` names another one, such as that of an
+/// earlier commit: what a test asks for can be seen to be missing there.
 pub fn binary() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| {
+        if let Some(other) = std::env::var_os("MAGEX_BINARY") {
+            return other.into();
+        }
         let own = std::env::current_exe().expect("this test's own path");
         let folder = own.parent().and_then(Path::parent).expect("target/<profile>/deps/<test>");
         let path = folder.join("magex");
@@ -58,8 +62,13 @@ impl Process {
 
     /// The same with these variables in its environment.
     pub fn start_in(arguments: &[&str], environment: &[(String, PathBuf)], log: &Path) -> Self {
+        Self::start_program(binary(), arguments, environment, log)
+    }
+
+    /// The same with another program, such as that of an earlier commit.
+    pub fn start_program(program: &Path, arguments: &[&str], environment: &[(String, PathBuf)], log: &Path) -> Self {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log).expect("a log file");
-        let child = Command::new(binary())
+        let child = Command::new(program)
             .args(arguments)
             .envs(environment.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::null())
@@ -110,6 +119,11 @@ impl Process {
         environment
             .split(|byte| *byte == 0)
             .any(|line| line.split(|byte| *byte == b'=').next() == Some(name.as_bytes()))
+    }
+
+    /// Its number.
+    pub fn id(&self) -> u32 {
+        self.child.id()
     }
 
     /// SIGKILL.
@@ -180,6 +194,9 @@ pub struct Cluster {
     run: PathBuf,
     lease: String,
     wires: Option<Wires>,
+    data: Option<PathBuf>,
+    /// The program of the services that are started next.
+    pub program: PathBuf,
 }
 
 /// What is between the processes of a cluster.
@@ -213,11 +230,23 @@ pub struct Setup {
     pub options: Vec<String>,
     /// Variables in the environment of all of them.
     pub environment: Vec<(String, PathBuf)>,
+    /// The folder of the commander's missions.
+    pub data: Option<PathBuf>,
+    /// The program of all of them.
+    pub program: PathBuf,
 }
 
 impl Default for Setup {
     fn default() -> Self {
-        Self { lease: 2.0, run: None, wires: None, options: Vec::new(), environment: Vec::new() }
+        Self {
+            lease: 2.0,
+            run: None,
+            wires: None,
+            options: Vec::new(),
+            environment: Vec::new(),
+            data: None,
+            program: binary().to_owned(),
+        }
     }
 }
 
@@ -243,7 +272,8 @@ impl Cluster {
         let mut arguments = vec!["learner", "--config", &given, "--out", &out, "--listen", "127.0.0.1:0"];
         arguments.extend(["--threads", "1", "--lease-seconds", &lease]);
         arguments.extend(setup.options.iter().map(String::as_str));
-        let mut learner = Process::start_in(&arguments, &setup.environment, &folder.path().join("learner.log"));
+        let log = folder.path().join("learner.log");
+        let mut learner = Process::start_program(&setup.program, &arguments, &setup.environment, &log);
         let ready = learner.ready_line();
         let learner_address = ready["address"].as_str().expect("the learner's address").to_owned();
         // The commander's address must be known before it starts.
@@ -270,6 +300,8 @@ impl Cluster {
             run,
             lease,
             wires,
+            data: setup.data,
+            program: setup.program,
         };
         cluster.note_page("learner", &ready);
         cluster.start_commander();
@@ -289,7 +321,10 @@ impl Cluster {
         let learner = format!("http://{learner}");
         let mut arguments = vec!["commander", "--learner", &learner, "--listen", &self.commander_address];
         arguments.extend(self.extra.iter().map(String::as_str));
-        let mut commander = Process::start_in(&arguments, &self.environment, &self.folder.path().join("commander.log"));
+        let data = self.data.as_deref().map(text);
+        arguments.extend(data.iter().flat_map(|data| ["--data", data]));
+        let log = self.folder.path().join("commander.log");
+        let mut commander = Process::start_program(&self.program, &arguments, &self.environment, &log);
         let ready = commander.ready_line();
         self.commander_address = ready["address"].as_str().expect("the commander's address").to_owned();
         self.commander = Some(commander);
@@ -319,8 +354,8 @@ impl Cluster {
             vec!["actor", "--learner", &learner, "--commander", &commander, "--threads", "1", "--name", &name];
         arguments.extend(extra);
         arguments.extend(self.extra.iter().map(String::as_str));
-        let mut actor =
-            Process::start_in(&arguments, &self.environment, &self.folder.path().join(format!("{name}.log")));
+        let log = self.folder.path().join(format!("{name}.log"));
+        let mut actor = Process::start_program(&self.program, &arguments, &self.environment, &log);
         // An actor is ready when a learner has accepted it, which may be never; only its page is of interest here.
         let ready = self.extra.iter().any(|option| option == "--http").then(|| actor.ready_line());
         self.actors.push(actor);
@@ -329,24 +364,26 @@ impl Cluster {
 
     /// Starts the learner again from its checkpoint, on its old address.
     pub fn resume_learner(&mut self) {
-        let run = self.run();
-        let mut learner = Process::start(
-            &[
-                "learner",
-                "--resume",
-                "--out",
-                &text(&run),
-                "--listen",
-                &self.learner_address,
-                "--threads",
-                "1",
-                "--lease-seconds",
-                &self.lease,
-            ],
-            &self.folder.path().join("learner.log"),
-        );
+        self.resume_learner_while(|_| {});
+    }
+
+    /// The same, and does something before the learner can be ready.
+    pub fn resume_learner_while(&mut self, meanwhile: impl FnOnce(&mut Process)) {
+        let run = text(&self.run());
+        let address = self.learner_address.clone();
+        let arguments = ["learner", "--resume", "--out", &run, "--listen", &address, "--threads", "1"];
+        let arguments: Vec<&str> = arguments.into_iter().chain(["--lease-seconds", &self.lease]).collect();
+        let log = self.folder.path().join("learner.log");
+        let mut learner = Process::start_program(&self.program, &arguments, &self.environment, &log);
+        meanwhile(&mut learner);
         learner.ready();
         self.learner = learner;
+    }
+
+    /// The logs of its processes.
+    pub fn logs(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.folder.path()).expect("the folder is there").filter_map(Result::ok);
+        entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|end| end == "log")).collect()
     }
 
     /// The run folder.

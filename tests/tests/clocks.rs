@@ -6,71 +6,14 @@ use magex_proto::v1;
 use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use magex_runtime::client;
 use magex_tests::sandbox::{Cluster, Process, Setup, wait_until};
+use magex_tests::wall::Wall;
 use magex_tests::{small, train};
-use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::path::Path;
+use std::time::Duration;
 use tonic::transport::Channel;
-
-/// Moves the time of day, and nothing else, by the seconds in a file.
-const SHIM: &str = r#"
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <time.h>
-int clock_gettime(clockid_t clock, struct timespec *time) {
-  static int (*real)(clockid_t, struct timespec *);
-  if (!real) real = (int (*)(clockid_t, struct timespec *))dlsym(RTLD_NEXT, "clock_gettime");
-  int code = real(clock, time);
-  if (clock != CLOCK_REALTIME) return code;
-  FILE *file = fopen(getenv("TEST_CLOCK"), "r");
-  long seconds = 0;
-  if (file) { if (fscanf(file, "%ld", &seconds) != 1) seconds = 0; fclose(file); }
-  time->tv_sec += seconds;
-  return code;
-}
-"#;
 
 const HOUR: i64 = 3600;
 const YEAR: i64 = 365 * 24 * HOUR;
-
-struct Wall {
-    folder: tempfile::TempDir,
-    library: PathBuf,
-}
-
-impl Wall {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let (source, library) = (folder.path().join("shim.c"), folder.path().join("shim.so"));
-        std::fs::write(&source, SHIM).unwrap();
-        let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&library, &source]).arg("-ldl").status();
-        assert!(built.unwrap().success());
-        Self { folder, library }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    /// Moves the time of day of every process that runs with [`Self::environment`].
-    fn set(&self, seconds: i64) {
-        std::fs::write(self.path("new"), seconds.to_string()).unwrap();
-        std::fs::rename(self.path("new"), self.path("clock")).unwrap();
-    }
-
-    fn environment(&self) -> [(String, PathBuf); 2] {
-        [("LD_PRELOAD".to_owned(), self.library.clone()), ("TEST_CLOCK".to_owned(), self.path("clock"))]
-    }
-
-    /// The offset that makes this moment 1970.
-    fn boot_without_battery() -> i64 {
-        #[allow(clippy::disallowed_methods, reason = "the time of day is what this test is about")]
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-        100 - now.as_secs() as i64
-    }
-}
 
 struct Commander {
     process: Process,
@@ -88,7 +31,7 @@ impl Commander {
     }
 
     async fn create(&mut self, id: &str, seconds: f64) -> v1::Assignment {
-        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], state: 0 };
+        let member = |id: &str| v1::Member { id: id.into(), position: vec![0.0, 1.0], ..Default::default() };
         let request = v1::CreateMissionRequest {
             mission_id: id.into(),
             agents: vec![member("a")],

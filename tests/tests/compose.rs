@@ -255,9 +255,23 @@ fn the_cluster_trains_scales_and_survives_and_learns_the_same_bits() {
     project.wait_for_health(3);
     assert_eq!(project.summary("disturbed"), disturbed);
 
+    // An off-policy learner in the same cluster, killed with its replay buffer half full.
+    let file = project.choose("off-policy", OFF_POLICY);
+    project.compose("up --detach");
+    project.wait_for_iterations("off-policy", 3);
+    let learner = project.container("learner");
+    docker(&format!("kill {learner}"));
+    docker(&format!("start {learner}"));
+    assert_eq!(project.summary("off-policy")["weights_sha256"], in_process(&file), "QMIX, its learner killed");
+
     project.compose("down --volumes --timeout 12");
     assert_eq!(project.left(), "", "down leaves nothing behind");
 }
+
+/// QMIX for some seconds.
+const OFF_POLICY: &str = "[run]\nalgorithm = 'qmix'\nmax_steps = 9600\neval_episodes = 4\nfinal_episodes = 6\n[task]\nname = 'simple-spread'\n\
+    agents = 5\nspawn = 'uniform'\nreward_target = 'team'\n[executor]\nkind = 'flat'\nrecurrent = true\n[commander]\nkind = 'random'\n\
+    [collect]\nepisodes_per_iteration = 8\n[qmix]\nbuffer_episodes = 64\nbatch_episodes = 8\nepisodes_per_gradient_step = 2\n";
 
 /// A run of seconds.
 const SHORT: &str = "[run]\nmax_steps = 1600\neval_episodes = 4\nfinal_episodes = 6\n[task]\nname = 'simple-spread'\nagents = 5\n\

@@ -15,6 +15,7 @@ use magex_runtime::{client, server};
 use magex_tests::decoders::files::Run;
 use magex_tests::decoders::mutate::Mutations;
 use magex_tests::decoders::{dispatch, wire};
+use magex_tests::raw::Raw;
 use prost::Message as _;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
@@ -40,7 +41,8 @@ fn run(name: &str, examples: Vec<Vec<u8>>, count: usize, target: impl Fn(&[u8]))
 }
 
 fn team() -> v1::AssignRequest {
-    let points = |coordinates: &[f32]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
+    let points =
+        |coordinates: &[f64]| Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() });
     let pair =
         |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
     v1::AssignRequest {
@@ -69,11 +71,38 @@ fn requests() -> Vec<Vec<u8>> {
         kinds.map(|kind| v1::AssignRequest { scheduler: kind.into(), ..team() }.encode_to_vec()).to_vec();
     let costs = Some(v1::CostMatrix { agents: 2, goals: 3, values: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0] });
     examples.push(v1::AssignRequest { costs, ..Default::default() }.encode_to_vec());
+    examples.push(worded().encode_to_vec());
+    let sparse = v1::SparseCosts {
+        agents: 3,
+        goals: 2,
+        agent_indices: vec![0, 1, 2],
+        goal_indices: vec![0, 1, 1],
+        values: vec![1.0, 2.0, f64::INFINITY],
+    };
+    examples.push(v1::AssignRequest { sparse_costs: Some(sparse), ..Default::default() }.encode_to_vec());
     examples
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+/// A team that says every word.
+fn worded() -> v1::AssignRequest {
+    v1::AssignRequest {
+        power: Some(2.0),
+        agent_speeds: vec![1.0, 2.0, 0.5],
+        agent_offsets: vec![0.0, 3.0, 1.0],
+        agent_loads: vec![1.0, 0.0, 2.0],
+        balance: 0.5,
+        goal_weights: vec![1.0, 2.0, 3.0],
+        goal_capacities: vec![2, 1, 1],
+        goal_earliest: vec![0.0, 4.0, 0.0],
+        goal_due: vec![f64::INFINITY, 40.0, 9.0],
+        precedence: vec![v1::Precedence { goal_id: "z".into(), after_id: "x".into(), ..Default::default() }],
+        pinned: vec![v1::PairRef { agent_id: "c".into(), goal_id: "y".into(), ..Default::default() }],
+        ..team()
+    }
+}
+
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 fn mission() -> v1::CreateMissionRequest {
@@ -100,7 +129,39 @@ fn framed<const BYTES: usize>(messages: &[Vec<u8>]) -> Vec<u8> {
 fn requests_missions_and_their_records() {
     run("assign", requests(), 200_000, dispatch::assign);
     let life = framed::<1>(&[mission().encode_to_vec(), update().encode_to_vec(), update().encode_to_vec()]);
-    run("mission", vec![life], 100_000, dispatch::mission);
+    let pair =
+        |agent: &str, goal: &str| v1::PairRef { agent_id: agent.into(), goal_id: goal.into(), ..Default::default() };
+    let worded = v1::CreateMissionRequest {
+        power: Some(1.5),
+        balance: 1.0,
+        time: 5.0,
+        pinned: vec![pair("a", "x")],
+        agents: vec![
+            v1::Member { speed: Some(2.0), busy_until: Some(9.0), load: Some(1.0), ..member("a", 0.0) },
+            member("b", 4.0),
+        ],
+        goals: vec![
+            v1::Member {
+                weight: Some(2.0),
+                capacity: Some(2),
+                earliest: Some(6.0),
+                due: Some(70.0),
+                ..member("x", 1.0)
+            },
+            v1::Member { after: Some(v1::GoalNames { goal_ids: vec!["x".into()] }), ..member("y", 5.0) },
+        ],
+        ..mission()
+    };
+    let later = v1::UpdateMissionRequest {
+        time: Some(8.0),
+        power: Some(2.0),
+        unpin: vec![pair("a", "x")],
+        pin: vec![pair("b", "x")],
+        forfeit: vec!["a".into()],
+        ..update()
+    };
+    let words = framed::<1>(&[worded.encode_to_vec(), later.encode_to_vec(), update().encode_to_vec()]);
+    run("mission", vec![life, words], 100_000, dispatch::mission);
     let limits = magex_dispatch::mission::MissionLimits { members: 16, lifetime_ms: 1000 };
     let planner = |problem: &magex_dispatch::Problem| {
         let plan = magex_dispatch::engine::solve(problem, problem.scheduler, &|| true)?;
@@ -180,46 +241,6 @@ fn weights_files_and_checkpoints() {
     run("checkpoint", damaged.good_files(), 6_000, |bytes| damaged.checkpoint(bytes));
 }
 
-/// Sends bytes as they are.
-#[derive(Debug, Clone, Copy, Default)]
-struct Raw;
-
-impl tonic::codec::Codec for Raw {
-    type Encode = Vec<u8>;
-    type Decode = Vec<u8>;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        *self
-    }
-
-    fn decoder(&mut self) -> Self {
-        *self
-    }
-}
-
-impl tonic::codec::Encoder for Raw {
-    type Item = Vec<u8>;
-    type Error = tonic::Status;
-
-    fn encode(&mut self, item: Vec<u8>, buffer: &mut tonic::codec::EncodeBuf<'_>) -> Result<(), tonic::Status> {
-        bytes::BufMut::put_slice(buffer, &item);
-        Ok(())
-    }
-}
-
-impl tonic::codec::Decoder for Raw {
-    type Item = Vec<u8>;
-    type Error = tonic::Status;
-
-    fn decode(&mut self, buffer: &mut tonic::codec::DecodeBuf<'_>) -> Result<Option<Vec<u8>>, tonic::Status> {
-        let mut bytes = vec![0; bytes::Buf::remaining(buffer)];
-        bytes::Buf::copy_to_slice(buffer, &mut bytes);
-        Ok(Some(bytes))
-    }
-}
-
 /// Whatever comes in over the wire, the service answers with sense, in time, and goes on.
 #[tokio::test(flavor = "multi_thread")]
 async fn the_whole_commander() {
@@ -255,7 +276,7 @@ async fn the_whole_commander() {
             let bytes = mutations.draw();
             raw.ready().await.unwrap();
             let path = PathAndQuery::try_from(format!("/magex.v1.CommanderService/{method}")).unwrap();
-            let call = raw.unary(Request::new(bytes.clone()), path, Raw);
+            let call = raw.unary(Request::new(bytes.clone().into()), path, Raw);
             match tokio::time::timeout(Duration::from_secs(60), call).await.unwrap() {
                 Ok(answer) => {
                     answered += 1;
@@ -263,7 +284,12 @@ async fn the_whole_commander() {
                         let response = v1::AssignResponse::decode(&answer.into_inner()[..]).unwrap();
                         let problem =
                             magex_dispatch::Problem::read(request, 1, &magex_dispatch::Limits::default()).unwrap();
-                        dispatch::check_matching(&response, problem.agent_count, problem.goal_count);
+                        dispatch::check_matching(
+                            &response,
+                            problem.agent_count,
+                            &problem.terms.capacities,
+                            problem.goal_count,
+                        );
                     }
                 }
                 Err(status) => match status.code() {

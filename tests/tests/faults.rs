@@ -9,11 +9,12 @@ use magex_learner::trainer::Trainer;
 use magex_tests::proxy::{Faults, Proxy};
 use magex_tests::relay::Relay;
 use magex_tests::sandbox::{Cluster, Process, Setup, wait_until};
+use magex_tests::small_disk::SmallDisk;
 use magex_tests::{drive, small, train};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 fn undisturbed(config: &RunConfig) -> String {
@@ -111,58 +112,13 @@ fn repeated_reordered_and_damaged_results_change_nothing() {
     assert_eq!(cluster.finish(), undisturbed(&config));
 }
 
-/// A small file system of its own; unmounted when dropped.
-struct SmallDisk {
-    folder: tempfile::TempDir,
-}
-
-impl SmallDisk {
-    /// `None`, loudly, where this user cannot mount one.
-    fn mount(size: &str) -> Option<Self> {
-        let folder = tempfile::tempdir().unwrap();
-        let options = format!("size={size}");
-        let mounted =
-            Command::new("mount").args(["-t", "tmpfs", "-o", &options, "magex-test"]).arg(folder.path()).status();
-        if mounted.is_ok_and(|status| status.success()) {
-            return Some(Self { folder });
-        }
-        assert!(
-            std::env::var_os("MAGEX_CI_MOUNT").is_none(),
-            "a small file system cannot be mounted, and must be here"
-        );
-        eprintln!("NOT CHECKED: a full disk; this user cannot mount a small file system");
-        None
-    }
-
-    fn ballast(&self) -> PathBuf {
-        self.folder.path().join("ballast")
-    }
-
-    /// Takes all the room there is.
-    fn fill(&self) {
-        let mut file = std::fs::File::create(self.ballast()).unwrap();
-        let zeros = [0; 4096];
-        while std::io::Write::write_all(&mut file, &zeros).is_ok() {}
-    }
-
-    fn make_room(&self) {
-        std::fs::remove_file(self.ballast()).unwrap();
-    }
-}
-
-impl Drop for SmallDisk {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg("-l").arg(self.folder.path()).status();
-    }
-}
-
 #[test]
 fn a_full_disk_ends_nothing_and_tears_no_line() {
     let Some(disk) = SmallDisk::mount("16m") else { return };
     // Many more iterations than are needed: what is waited for is what the learner says, not how far it has come.
     let iterations = 600;
     let config = small(ExecutorKind::Local, 5, iterations);
-    let run = disk.folder.path().join("run");
+    let run = disk.path().join("run");
     let mut cluster = Cluster::start_with(&config, Setup { run: Some(run.clone()), ..Setup::default() });
     cluster.start_actor();
     cluster.wait_for_iteration(6);
@@ -205,17 +161,17 @@ fn newest(run: &Path) -> Option<PathBuf> {
 /// A disk that is cut off, as by a kill, at one step: half of what that step writes is there, and nothing after it happens.
 #[derive(Debug)]
 struct CutDisk {
-    left: usize,
+    left: AtomicUsize,
 }
 
 impl CutDisk {
-    fn step(&mut self, whole: impl FnOnce() -> std::io::Result<()>, half: impl FnOnce()) -> std::io::Result<()> {
-        if self.left > 1 {
-            self.left -= 1;
+    fn step(&self, whole: impl FnOnce() -> std::io::Result<()>, half: impl FnOnce()) -> std::io::Result<()> {
+        let left = self.left.load(Ordering::SeqCst);
+        self.left.store(left.saturating_sub(1), Ordering::SeqCst);
+        if left > 1 {
             return whole();
         }
-        if self.left == 1 {
-            self.left = 0;
+        if left == 1 {
             half();
         }
         Err(std::io::Error::other("cut off"))
@@ -223,23 +179,23 @@ impl CutDisk {
 }
 
 impl Disk for CutDisk {
-    fn create_dir(&mut self, path: &Path) -> std::io::Result<()> {
+    fn create_dir(&self, path: &Path) -> std::io::Result<()> {
         self.step(|| FileSystem.create_dir(path), || {})
     }
 
-    fn write(&mut self, path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    fn write(&self, path: &Path, bytes: &[u8]) -> std::io::Result<()> {
         self.step(|| FileSystem.write(path, bytes), || FileSystem.write(path, &bytes[..bytes.len() / 2]).unwrap())
     }
 
-    fn sync(&mut self, path: &Path) -> std::io::Result<()> {
+    fn sync(&self, path: &Path) -> std::io::Result<()> {
         self.step(|| FileSystem.sync(path), || {})
     }
 
-    fn rename(&mut self, from: &Path, to: &Path) -> std::io::Result<()> {
+    fn rename(&self, from: &Path, to: &Path) -> std::io::Result<()> {
         self.step(|| FileSystem.rename(from, to), || {})
     }
 
-    fn remove_dir(&mut self, path: &Path) -> std::io::Result<()> {
+    fn remove_dir(&self, path: &Path) -> std::io::Result<()> {
         let half = || {
             // Some of it goes before the end.
             if let Some(Ok(entry)) = std::fs::read_dir(path).unwrap().next() {
@@ -278,14 +234,14 @@ fn a_kill_at_any_step_of_writing_a_checkpoint_leaves_a_run_that_learns_the_same_
         loop {
             let run = tempfile::tempdir().unwrap();
             copy_run(base.path(), run.path());
-            let mut disk = CutDisk { left: cut };
-            let written = checkpoint::write_on(&mut disk, run.path(), progress, weights, 1);
+            let disk = CutDisk { left: cut.into() };
+            let written = checkpoint::write_on(&disk, run.path(), progress, weights, 1);
             let (found, _, _) = checkpoint::read_latest(run.path(), &template)
                 .unwrap_or_else(|error| panic!("cut at step {cut} of iteration {}: {error}", progress.iteration));
             assert!(found.iteration == 2 || found.iteration == progress.iteration, "cut {cut}: {}", found.iteration);
             let (resumed, _) = Trainer::resume(&config, run.path(), 1).unwrap();
             assert_eq!(drive(resumed, &config, 1, &never).sha256, expected, "cut at step {cut}");
-            if disk.left > 0 {
+            if disk.left.into_inner() > 0 {
                 assert!(written.is_ok());
                 break;
             }

@@ -4,6 +4,8 @@
 use magex_core::config::ExecutorKind;
 use magex_tests::sandbox::{Process, binary, wait_until};
 use magex_tests::small;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -50,6 +52,17 @@ impl Place {
         assert!(output.status.code() == Some(code) && err.contains(words), "{line}: {} {err}", output.status);
         assert!(!out.contains("ready"), "{line}: {out}");
     }
+}
+
+/// The metrics of a service.
+fn scrape(address: &str) -> String {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream
+        .write_all(format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").as_bytes())
+        .unwrap();
+    let mut text = String::new();
+    stream.read_to_string(&mut text).unwrap();
+    text
 }
 
 fn replace(path: &Path, text: &str) {
@@ -151,6 +164,33 @@ fn the_command_line_says_what_is_at_an_address() {
     let output =
         place.magex(&format!("assign --scheduler exact --json --connect http://{plain} --agents [] --goals [[1,2]]"));
     assert!(output.status.success() && String::from_utf8_lossy(&output.stdout).contains("\"unassigned_goals\":[0]"));
+}
+
+#[test]
+fn certificates_that_have_ended_or_end_soon_are_named_at_the_start_and_in_a_metric() {
+    let place = Place::new();
+    // A service's own certificate, and the one of the authority that it trusts.
+    [("good", 2100), ("over", 2001)].iter().for_each(|(name, year)| place.sign(name, *year));
+    for (name, tls, ended) in [
+        ("fine", "--tls-cert @good.pem --tls-key @good.key --client-ca @good.pem", None),
+        ("own", "--tls-cert @over.pem --tls-key @over.key", Some("over.pem")),
+        ("trusted", "--tls-cert @good.pem --tls-key @good.key --client-ca @over.pem", Some("over.pem")),
+    ] {
+        let line = format!("commander --listen 127.0.0.1:0 --http 127.0.0.1:0 {tls}");
+        let mut service = place.process(name, &line);
+        let page = service.ready_line()["http"].as_str().unwrap().to_owned();
+        let scraped = scrape(&page);
+        let end = scraped.lines().find_map(|line| line.strip_prefix("process_certificate_end_time_seconds "));
+        let end: f64 = end.unwrap_or_else(|| panic!("no end in {scraped}")).parse().unwrap();
+        match ended {
+            Some(file) => {
+                let words = ["this certificate ended", "peers refuse it: renew it", file];
+                wait_until("the warning", || words.iter().all(|word| service.log().contains(word)));
+                assert!(end < 1.1e9, "{end}");
+            }
+            None => assert!(end > 4e9 && !service.log().contains("this certificate"), "{end} {}", service.log()),
+        }
+    }
 }
 
 #[test]

@@ -21,8 +21,8 @@ fn client(name: &str) -> Caller {
 
 fn members(side: &str, count: usize) -> Vec<v1::Member> {
     // Far from regular: the solver has something to do.
-    let position = |k: usize| vec![(k * 7919 % 1009) as f32, (k * k % 997) as f32];
-    (0..count).map(|k| v1::Member { id: format!("{side}{k}"), position: position(k), state: 0 }).collect()
+    let position = |k: usize| vec![(k * 7919 % 1009) as f64, (k * k % 997) as f64];
+    (0..count).map(|k| v1::Member { id: format!("{side}{k}"), position: position(k), ..Default::default() }).collect()
 }
 
 fn request(id: &str, agents: usize, goals: usize) -> v1::CreateMissionRequest {

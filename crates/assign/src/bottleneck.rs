@@ -3,23 +3,23 @@
 //! Binary search over the sorted costs with Hopcroft & Karp's maximum matching (1973) on the pairs up to the threshold;
 //! among the assignments with the smallest largest cost, the one with the smallest sum.
 
-use crate::greedy::ascending;
-use crate::{AssignError, Assignment, Solver, UNASSIGNED, check_allowed, cost_of};
+use crate::{AssignError, Assignment, Solver, Switching, UNASSIGNED, check_allowed, pairs};
 
 const NONE: u32 = u32::MAX;
 
-/// The solver's memory. Reusing one allocates nothing but the answers.
+/// The solver's memory. Reusing one allocates little but the answers.
 #[derive(Debug, Default)]
 pub struct BottleneckSolver {
     solver: Solver,
     matcher: Matcher,
-    /// The costs, sorted; later the costs up to the threshold.
+    /// The costs up to the threshold.
     values: Vec<f64>,
 }
 
 impl BottleneckSolver {
     /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where +∞ forbids a pair; among those the smallest largest
-    /// cost, then the smallest sum. Stops as soon as `should_continue` returns false. Fails as [`Solver::solve_allowed`].
+    /// cost, then the smallest sum, then the lowest matching. Costs of d^p make the sum one of d^p among the same smallest
+    /// largest distances. Stops as soon as `should_continue` returns false. Fails as [`Solver::solve_allowed`].
     pub fn solve_allowed(
         &mut self,
         cost: &[f64],
@@ -27,41 +27,93 @@ impl BottleneckSolver {
         cols: usize,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
+        self.solve_switching(cost, rows, cols, &Switching::default(), should_continue)
+    }
+
+    /// The same where some pairs are in force: a pair of a row that leaves its column costs the switching cost more. Minimises
+    /// the largest of these costs, then summed cost + switching cost × rows that leave, then the number of rows that do.
+    /// Fails as [`Solver::solve_switching`].
+    pub fn solve_switching(
+        &mut self,
+        cost: &[f64],
+        rows: usize,
+        cols: usize,
+        switching: &Switching<'_>,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<Assignment, AssignError> {
         check_allowed(cost, rows, cols)?;
+        switching.check(rows, cols)?;
         let Self { solver, matcher, values } = self;
-        values.clear();
-        values.extend(cost.iter().copied().filter(|&value| value < f64::INFINITY));
-        if values.is_empty() {
+        let costs = Costs { cost, rows, cols };
+        let found = if pairs(switching.current).next().is_none() || switching.cost == 0.0 {
+            costs.search(matcher, values, |place| cost[place], should_continue)?
+        } else {
+            let key = |place: usize| {
+                let (row, col) = (place / cols, place % cols);
+                let leaves = switching.current[row] != UNASSIGNED && !switching.holds(row, col);
+                exact_sum(cost[place], if leaves { switching.cost } else { 0.0 })
+            };
+            costs.search(matcher, values, key, should_continue)?
+        };
+        if !found {
             return Ok(Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 });
         }
-        let none_forbidden = values.len() == cost.len();
-        values.sort_unstable_by_key(|&value| ascending(value));
-        values.dedup();
-        let pairs = match none_forbidden {
+        solver.solve_switching(values, rows, cols, switching, should_continue)
+    }
+}
+
+/// A sum and what it lost to rounding (Knuth): such pairs sort like the exact sums.
+fn exact_sum(a: f64, b: f64) -> (f64, f64) {
+    let sum = a + b;
+    let shadow = sum - a;
+    (sum, (a - (sum - shadow)) + (b - shadow))
+}
+
+/// Costs `[rows, cols]`.
+struct Costs<'a> {
+    cost: &'a [f64],
+    rows: usize,
+    cols: usize,
+}
+
+impl Costs<'_> {
+    /// Finds the smallest largest key of a largest matching, and fills `values` with the costs of the pairs up to it and +∞ for
+    /// the others. False if all pairs are forbidden.
+    fn search<K: PartialOrd + Copy>(
+        &self,
+        matcher: &mut Matcher,
+        values: &mut Vec<f64>,
+        key: impl Fn(usize) -> K,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<bool, AssignError> {
+        let &Self { cost, rows, cols } = self;
+        let allowed = |place: &usize| cost[*place] < f64::INFINITY;
+        let order = |a: &K, b: &K| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal);
+        let mut keys: Vec<K> = (0..cost.len()).filter(allowed).map(&key).collect();
+        if keys.is_empty() {
+            return Ok(false);
+        }
+        let key = &key;
+        let up_to = |limit: K| move |place: usize| cost[place] < f64::INFINITY && key(place) <= limit;
+        let pairs = match keys.len() == cost.len() {
             true => rows.min(cols),
-            false => matcher.run(cost, rows, cols, values[values.len() - 1], should_continue)?,
+            false => matcher.run(rows, cols, |place| cost[place] < f64::INFINITY, should_continue)?,
         };
-        let (mut low, mut high) = (0, values.len() - 1);
+        keys.sort_unstable_by(order);
+        keys.dedup();
+        let (mut low, mut high) = (0, keys.len() - 1);
         while low < high {
             let middle = low + (high - low) / 2;
-            if matcher.run(cost, rows, cols, values[middle], should_continue)? == pairs {
+            if matcher.run(rows, cols, up_to(keys[middle]), should_continue)? == pairs {
                 high = middle;
             } else {
                 low = middle + 1;
             }
         }
-        let largest = values[low];
+        let within = up_to(keys[low]);
         values.clear();
-        values.extend(cost.iter().map(|&value| if value <= largest { value } else { f64::INFINITY }));
-        let assignment = solver.solve_allowed(values, rows, cols, should_continue)?;
-        // Rounding of a penalty could only matter at the edge of the number range; the matching is the safe answer.
-        if assignment.pairs().count() == pairs {
-            return Ok(assignment);
-        }
-        matcher.run(cost, rows, cols, largest, should_continue)?;
-        let col_of_row = matcher.col_of_row.clone();
-        let cost = cost_of(cost, cols, &col_of_row);
-        Ok(Assignment { col_of_row, cost })
+        values.extend((0..cost.len()).map(|place| if within(place) { cost[place] } else { f64::INFINITY }));
+        Ok(true)
     }
 }
 
@@ -81,13 +133,12 @@ pub(crate) struct Matcher {
 }
 
 impl Matcher {
-    /// Size of the largest matching. `should_continue` is called before every round of paths of the same length.
+    /// Size of the largest matching of allowed places of a matrix `[rows, cols]`. `should_continue` is called before every round of paths of the same length.
     pub(crate) fn run(
         &mut self,
-        cost: &[f64],
         rows: usize,
         cols: usize,
-        threshold: f64,
+        allowed: impl Fn(usize) -> bool,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<usize, AssignError> {
         if !should_continue() {
@@ -96,8 +147,8 @@ impl Matcher {
         self.edges.clear();
         self.start.clear();
         self.start.push(0);
-        for row in cost.chunks_exact(cols) {
-            self.edges.extend((0..cols as u32).filter(|&col| row[col as usize] <= threshold));
+        for row in 0..rows {
+            self.edges.extend((0..cols as u32).filter(|&col| allowed(row * cols + col as usize)));
             self.start.push(self.edges.len());
         }
         self.col_of_row.clear();

@@ -5,19 +5,21 @@
 //! out: a column that stays alone must keep the price 0, and only columns with a partner are repriced later.
 //!
 //! Floating point: row prices are never stored (they follow from the matched entry), a repricing that rounds to nothing
-//! does not count as progress, and the number of displacements is bounded, so no input can cycle. Ties go to the
-//! lowest index, free columns first: the answer is a function of the input alone.
+//! does not count as progress, and the number of displacements is bounded, so no input can cycle. What rounding leaves open is
+//! decided without it afterwards ([`crate::ties`]).
 
+mod problem;
 mod shortlist;
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, check_costs, cost_of, distances_into};
+use crate::ties::{self, Graph, NONE, Solution};
+use crate::{AssignError, Assignment, PointProblem, Switching, UNASSIGNED, check_costs, cost_of, solve_points};
+use problem::Matrix;
 use shortlist::{Shortlists, WORTH_IT};
 
-const NONE: u32 = u32::MAX;
 /// Columns are padded to whole groups of this size; each scan keeps this many independent minima.
 const LANES: usize = 8;
 
-/// The solver's memory. Reusing one solver allocates nothing but the answers.
+/// The solver's memory. Reusing one solver allocates little but the answers.
 #[derive(Debug, Clone, Default)]
 pub struct Solver {
     /// `[rows, stride]` with rows ≤ cols ≤ stride; +∞ in the padding. Not used for costs that have this form as they are.
@@ -42,6 +44,9 @@ pub struct Solver {
     pub(crate) lists_from: Option<usize>,
     /// Rows of the tree of which only the shortlist was looked at: index in the tree, and what the rest cannot undercut.
     unread: Vec<(usize, f64)>,
+    /// `[rows]` dual price of each row, once all have a column.
+    row_price: Vec<f64>,
+    near: Graph,
 }
 
 /// A row of the shortest-path tree.
@@ -58,19 +63,22 @@ struct Branch {
 
 /// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
 /// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
-pub fn exact_points(agents: &[f32], goals: &[f32], dims: usize) -> Result<(Vec<u32>, f64), AssignError> {
-    let mut cost = Vec::new();
-    let (rows, cols) = distances_into(agents, goals, dims, &mut cost)?;
-    let answer = Solver::default().solve(&cost, rows, cols)?;
+pub fn exact_points<T: Copy + Into<f64>>(
+    agents: &[T],
+    goals: &[T],
+    dims: usize,
+) -> Result<(Vec<u32>, f64), AssignError> {
+    let answer = solve_points(&PointProblem::new(agents, goals, dims), &|| true)?;
     Ok((answer.col_of_row, answer.cost))
 }
 
 impl Solver {
-    /// The assignment of min(rows, cols) pairs with the smallest summed cost; `cost` is row-major `[rows, cols]`.
+    /// The assignment of min(rows, cols) pairs with the smallest summed cost, the lowest one of several; `cost` is row-major
+    /// `[rows, cols]`.
     /// Fails for mismatched shapes, and at the first entry that is NaN, infinite or beyond 1e300.
     pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
         check_costs(cost, rows, cols)?;
-        self.solve_checked(cost, rows, cols, None, &|| true)
+        self.solve_matrix(&Matrix::new(cost, rows, cols), &|| true)
     }
 
     /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
@@ -82,38 +90,50 @@ impl Solver {
         cols: usize,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
-        let span = check_allowed(cost, rows, cols)?;
-        let penalty = if span.forbidden == 0 { None } else { Some(span.penalty(rows.min(cols))) };
-        self.solve_checked(cost, rows, cols, penalty, should_continue)
+        self.solve_switching(cost, rows, cols, &Switching::default(), should_continue)
     }
 
-    /// Solves what was checked, with `penalty` in the place of +∞; pairs that paid it are taken out again.
-    fn solve_checked(
+    /// The same where some pairs are in force: minimises summed cost + switching cost × rows that leave their column, then the
+    /// number of rows that do. [`Assignment::cost`] is the summed cost alone.
+    /// Fails for current pairs beyond the matrix or of one column twice, and a switching cost outside 0 ..= 1e300, too.
+    pub fn solve_switching(
         &mut self,
         cost: &[f64],
         rows: usize,
         cols: usize,
-        penalty: Option<f64>,
+        switching: &Switching<'_>,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Assignment, AssignError> {
+        self.solve_matrix(&Matrix::check(cost, rows, cols, switching)?, should_continue)
+    }
+
+    /// Solves what was checked.
+    fn solve_matrix(
+        &mut self,
+        matrix: &Matrix<'_>,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<Assignment, AssignError> {
+        let &Matrix { cost, rows, cols, .. } = matrix;
         let wide = rows <= cols;
         let mut own = std::mem::take(&mut self.cost);
         self.stride = rows.max(cols).next_multiple_of(LANES);
         // A copy of a large matrix would take as long as a good part of the solution.
-        let as_it_is = wide && self.stride == cols && penalty.is_none();
+        let as_it_is = wide && self.stride == cols && matrix.is_plain();
         if !as_it_is {
-            load(&mut own, self.stride, cost, rows, cols, penalty);
+            matrix.load(&mut own, self.stride);
         }
-        let solved = self.run(if as_it_is { cost } else { &own }, rows.min(cols), rows.max(cols), should_continue);
+        let used = if as_it_is { cost } else { &own };
+        let solved = self.run(used, rows.min(cols), rows.max(cols), should_continue);
+        let settled = solved.and_then(|()| self.settle(used, matrix, should_continue));
         self.cost = own;
-        solved?;
+        settled?;
         let mut col_of_row: Vec<u32> = if wide {
             self.col_of_row.clone()
         } else {
             // Solved as the transpose: the solver's columns are our rows, its padding is not.
             self.row_of_col[..rows].iter().map(|&col| if col == NONE { UNASSIGNED } else { col }).collect()
         };
-        if penalty.is_some() {
+        if matrix.penalty.is_some() {
             for (row, col) in col_of_row.iter_mut().enumerate() {
                 if *col != UNASSIGNED && cost[row * cols + *col as usize] == f64::INFINITY {
                     *col = UNASSIGNED;
@@ -122,6 +142,42 @@ impl Solver {
         }
         let cost = cost_of(cost, cols, &col_of_row);
         Ok(Assignment { col_of_row, cost })
+    }
+
+    /// Makes the matching that was found the exact one, and the lowest of several.
+    fn settle(
+        &mut self,
+        cost: &[f64],
+        matrix: &Matrix<'_>,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError> {
+        let (rows, cols) = (matrix.rows.min(matrix.cols), matrix.rows.max(matrix.cols));
+        let Self { stride, price, row_price, row_of_col, col_of_row, near, .. } = self;
+        let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
+        row_price.clear();
+        row_price.extend(
+            cost.chunks_exact(*stride)
+                .zip(col_of_row.iter())
+                .map(|(costs, &col)| costs[col as usize] - price[col as usize]),
+        );
+        let mut tolerance = ties::tolerance(rows, magnitude(row_price), magnitude(&price[..cols]));
+        loop {
+            near.clear();
+            let mut beaten = 0.0;
+            for (costs, &own) in cost.chunks_exact(*stride).zip(row_price.iter()) {
+                let least = nearly_tight(costs, price, own + tolerance, &mut near.cols);
+                beaten += higher(own - least, 0.0);
+                near.end_row();
+            }
+            // A repricing that rounds leaves pairs that look better than tight.
+            if beaten <= 0.25 * tolerance {
+                break;
+            }
+            tolerance += 8.0 * beaten;
+        }
+        let row_of_col = &mut row_of_col[..cols];
+        let mut solution = Solution { row_price, col_price: &price[..cols], col_of_row, row_of_col };
+        ties::settle(near, tolerance, &mut solution, matrix, should_continue)
     }
 
     fn run(
@@ -305,24 +361,28 @@ impl Solver {
     }
 }
 
-/// Copies the costs, transposed if there are more rows than columns, and pads every row. Forbidden pairs get a price.
-fn load(own: &mut Vec<f64>, stride: usize, cost: &[f64], rows: usize, cols: usize, penalty: Option<f64>) {
-    let short = rows.min(cols);
-    own.clear();
-    own.reserve(short * stride);
-    for row in 0..short {
-        if rows <= cols {
-            own.extend_from_slice(&cost[row * cols..(row + 1) * cols]);
-        } else {
-            own.extend((0..rows).map(|i| cost[i * cols + row]));
+/// Appends the columns whose cost − price is up to `limit`, ascending, and returns the least.
+fn nearly_tight(costs: &[f64], price: &[f64], limit: f64, near: &mut Vec<u32>) -> f64 {
+    let mut least = [f64::INFINITY; LANES];
+    let chunks = costs.as_chunks::<LANES>().0.iter().zip(price.as_chunks::<LANES>().0);
+    for (chunk, (costs, price)) in chunks.enumerate() {
+        let mut hits = 0u8;
+        for lane in 0..LANES {
+            let reduced = costs[lane] - price[lane];
+            least[lane] = lower(reduced, least[lane]);
+            hits |= u8::from(reduced <= limit) << lane;
         }
-        if let Some(penalty) = penalty {
-            for value in &mut own[row * stride..] {
-                *value = if *value == f64::INFINITY { penalty } else { *value };
+        let first = (chunk * LANES) as u32;
+        if hits == u8::MAX {
+            near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
+        } else {
+            while hits != 0 {
+                near.push(first + hits.trailing_zeros());
+                hits &= hits - 1;
             }
         }
-        own.resize((row + 1) * stride, f64::INFINITY);
     }
+    least.into_iter().fold(f64::INFINITY, lower)
 }
 
 /// The two smallest cost − price of a row, equal if the smallest occurs twice.
@@ -406,6 +466,12 @@ fn least(distance: &[f64]) -> f64 {
 #[inline(always)]
 fn lower(a: f64, b: f64) -> f64 {
     if a < b { a } else { b }
+}
+
+/// The larger one.
+#[inline(always)]
+fn higher(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 /// The column at this distance: the first one without an owner, which ends the search, else the first one.

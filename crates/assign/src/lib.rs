@@ -2,10 +2,28 @@
 //!
 //! [`exact`] is the optimum (the Hungarian baseline C_h of the paper's eq. 4), [`bottleneck`] minimises the longest distance
 //! instead of the sum, [`greedy()`] and [`random`] are the baselines a learned commander is compared with, and [`duals`] are
-//! entropic transport prices, a feature for such a commander.
+//! entropic transport prices, a feature for such a commander. [`solve_points`], [`bottleneck_points`] and [`solve_pairs`] give
+//! the same answers without a cost matrix, for thousands of agents.
 //!
 //! Costs are row-major `[rows, cols]`: rows are agents, columns are goals. Either side may be the longer one; it then
 //! keeps members without a partner, marked [`UNASSIGNED`].
+//!
+//! # What is minimised
+//!
+//! In this order, each among the answers that are best by those before it:
+//!
+//! 1. No pair is forbidden (a cost of +∞ forbids a pair).
+//! 2. The most pairs.
+//! 3. Bottleneck only: the largest cost of a pair, which is the switching cost more where the row leaves its current column.
+//! 4. Summed cost + switching cost × rows that do not keep their current column ([`Switching`]).
+//! 5. The fewest rows that do not keep their current column.
+//! 6. The lowest matching: row 0 has the lowest column that the best answers give it, then row 1, and so on; no column counts as
+//!    the highest.
+//!
+//! Costs are the doubles that are given, and their sums are compared as if they were added without rounding: 0.1 + 0.2 is more
+//! than 0.3, because these doubles are. Whoever wants sums of decimals to tie gives whole numbers, for example cents. Neither the
+//! range of the costs nor the size of the problem matters, so a pair of 10^50 that cannot be avoided leaves the others exact.
+//! There is one answer to every problem, the same from every solver of this crate; [`solve_points`] names the only exception.
 
 #![allow(
     clippy::needless_range_loop,
@@ -18,12 +36,22 @@ use thiserror::Error;
 pub mod bottleneck;
 pub mod duals;
 pub mod exact;
+mod fixed;
 pub mod greedy;
+mod points;
 pub mod random;
+mod sparse;
+mod switching;
+mod ties;
 
 pub use bottleneck::BottleneckSolver;
 pub use exact::{Solver, exact_points};
 pub use greedy::greedy;
+pub use points::{
+    LARGEST_COORDINATE, POWERS, cost_of_points, costs_into, distance, distances_into, powered, powered_square,
+};
+pub use sparse::{AllowedPairs, PointProblem, bottleneck_points, solve_pairs, solve_points};
+pub use switching::Switching;
 
 /// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).
 pub const UNASSIGNED: u32 = u32::MAX;
@@ -75,25 +103,8 @@ pub fn cost_of(cost: &[f64], cols: usize, col_of_row: &[u32]) -> f64 {
     compensated_sum(pairs(col_of_row).map(|(row, col)| cost[row * cols + col]))
 }
 
-/// Euclidean distance of two points, in double precision.
-pub fn distance(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>().sqrt()
-}
-
-/// Summed distance of an assignment, in double precision: agents `[N, dims]`, goals `[G, dims]`, `goal_of` `[N]` the goal of each
-/// agent. An agent without a goal ([`UNASSIGNED`]) costs nothing.
-pub fn cost_of_points(agents: &[f32], goals: &[f32], dims: usize, goal_of: &[u32]) -> f64 {
-    let mut total = 0.0;
-    for (agent, &goal) in agents.chunks_exact(dims).zip(goal_of) {
-        let start = goal as usize * dims;
-        if let Some(goal) = goals.get(start..start + dims) {
-            total += distance(agent, goal);
-        }
-    }
-    total
-}
-
-pub(crate) fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
+/// Sum with Neumaier's compensation.
+pub fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
     let (mut sum, mut lost) = (0.0f64, 0.0f64);
     for term in terms {
         let next = sum + term;
@@ -133,7 +144,7 @@ impl Span {
         }
         let range = self.largest - self.least;
         let step = range.max(self.largest.abs() * 1e-9).max(f64::MIN_POSITIVE);
-        (self.largest + pairs as f64 * range + step).min(LARGEST_COST)
+        self.largest + pairs as f64 * range + step
     }
 }
 
@@ -204,47 +215,6 @@ fn check_size(found: usize, rows: usize, cols: usize) -> Result<(), AssignError>
 
 fn invalid_size(field: &str, found: usize, expected: usize) -> AssignError {
     AssignError::invalid(field, format!("{found} numbers, the shape asks for {expected}"))
-}
-
-/// Distances `[rows, cols]` in f64 between agents `[rows, dims]` and goals `[cols, dims]`; returns (rows, cols).
-/// Fails for empty or ragged arrays and coordinates that are not finite.
-pub fn distances_into(
-    agents: &[f32],
-    goals: &[f32],
-    dims: usize,
-    cost: &mut Vec<f64>,
-) -> Result<(usize, usize), AssignError> {
-    if dims == 0 {
-        return Err(AssignError::invalid("dims", "0 is out of range; use at least 1"));
-    }
-    for (field, points) in [("agents", agents), ("goals", goals)] {
-        if !points.len().is_multiple_of(dims) {
-            return Err(invalid_size(field, points.len(), points.len().div_ceil(dims) * dims));
-        }
-        if let Some(place) = points.iter().position(|x| !x.is_finite()) {
-            let path = format!("{field}[{}][{}]", place / dims, place % dims);
-            return Err(AssignError::invalid(path, format!("{} is not finite", points[place])));
-        }
-    }
-    let (rows, cols) = (agents.len() / dims, goals.len() / dims);
-    check_shape(rows, cols)?;
-    cost.clear();
-    cost.reserve(rows * cols);
-    for agent in agents.chunks_exact(dims) {
-        if let &[x, y] = agent {
-            let (x, y) = (f64::from(x), f64::from(y));
-            cost.extend(goals.as_chunks::<2>().0.iter().map(|&[gx, gy]| {
-                let (dx, dy) = (x - f64::from(gx), y - f64::from(gy));
-                (dx * dx + dy * dy).sqrt()
-            }));
-        } else {
-            cost.extend(goals.chunks_exact(dims).map(|goal| {
-                let square = |(&a, &g): (&f32, &f32)| (f64::from(a) - f64::from(g)) * (f64::from(a) - f64::from(g));
-                agent.iter().zip(goal).map(square).sum::<f64>().sqrt()
-            }));
-        }
-    }
-    Ok((rows, cols))
 }
 
 #[cfg(test)]

@@ -37,7 +37,7 @@ pub fn random_allowed(
     let shuffled: Vec<f64> =
         row_order.iter().flat_map(|row| col_order.iter().map(move |col| entry(row, col))).collect();
     let mut matcher = Matcher::default();
-    matcher.run(&shuffled, rows, cols, 0.0, should_continue)?;
+    matcher.run(rows, cols, |place| shuffled[place] == 0.0, should_continue)?;
     let mut col_of_row = vec![UNASSIGNED; rows];
     for (place, &row) in row_order.iter().enumerate() {
         if let Some(&col) = col_order.get(matcher.col_of_row[place] as usize) {

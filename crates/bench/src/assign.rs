@@ -5,6 +5,7 @@ mod load;
 use crate::goals::learned_ratio;
 use crate::report::Report;
 use crate::runs::Keep;
+use crate::solver::limits::limits;
 use crate::solver::{distances, time_exact, uniform_points};
 use crate::vitals::memory_mib;
 use load::{Flood, flood, one_client, saturate};
@@ -32,6 +33,9 @@ pub(crate) struct AssignArgs {
     /// Only the solver, without a service.
     #[arg(long)]
     solver: bool,
+    /// Only the solvers at their limits: ties, clusters, 20,000 agents.
+    #[arg(long)]
+    limits: bool,
     /// Calls of the latency rows.
     #[arg(long, value_name = "K", default_value_t = 5000, value_parser = settings::count)]
     calls: u32,
@@ -52,6 +56,10 @@ pub(crate) struct AssignArgs {
 pub(crate) fn assign(args: &AssignArgs) -> anyhow::Result<Report> {
     let title = "Goal assignment: the exact solver on one core, the learned scheduler, and the service on loopback";
     let mut report = Report::new("assign", title, 1, &["what", "measured", "must", "aim"]);
+    if args.limits {
+        limits(&mut report, &args.python)?;
+        return Ok(report);
+    }
     solver_rows(&mut report, args)?;
     if args.solver {
         return Ok(report);
@@ -171,7 +179,9 @@ fn quality_rows(report: &mut Report, args: &AssignArgs, weights: &[u8], config: 
 
 fn team(n: usize, index: u32, scheduler: v1::AssignmentMethod) -> v1::AssignRequest {
     let (agents, goals) = uniform_points(n, index);
-    let points = |coordinates| Some(v1::Positions { dims: 2, coordinates, array: None });
+    let points = |points: Vec<f32>| {
+        Some(v1::Positions { dims: 2, coordinates: points.into_iter().map(f64::from).collect(), ..Default::default() })
+    };
     let scheduler = scheduler.into();
     v1::AssignRequest { agents: points(agents), goals: points(goals), scheduler, ..Default::default() }
 }
@@ -185,7 +195,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     let mut service = many.block_on(Service::new("commander", &arguments, folder).start())?;
     let url = format!("http://{}", service.address);
     for (kind, name, must, aim) in [
-        (v1::AssignmentMethod::Exact, "EXACT_TOTAL", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
+        (v1::AssignmentMethod::Exact, "EXACT", ["0.5 / 3 ms", "4,000/s"], ["0.2 / 1 ms", "15,000/s"]),
         (v1::AssignmentMethod::Learned, "LEARNED", ["2 / 8 ms", "800/s"], ["0.6 / 2 ms", "4,000/s"]),
     ] {
         let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, kind)).collect();
@@ -215,9 +225,7 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
     many.block_on(service.stop());
     let mut service = many.block_on(Service::new("commander", &arguments[..3], folder).start())?;
     let url = format!("http://{}", service.address);
-    for (kind, name) in
-        [(v1::AssignmentMethod::Exact, "EXACT_TOTAL"), (v1::AssignmentMethod::Makespan, "EXACT_MAKESPAN")]
-    {
+    for (kind, name) in [(v1::AssignmentMethod::Exact, "EXACT"), (v1::AssignmentMethod::Makespan, "MAKESPAN")] {
         let [seconds, ..] = one.block_on(one_client(&url, &[team(5000, 0, kind)], 1, kind))?;
         let (seconds, peak) = (seconds / 1e3, memory_mib(service.id(), "VmHWM:"));
         let text = format!("{seconds:.1} s, {peak:.0} MiB");

@@ -1,7 +1,7 @@
 //! The command line: the tables of docs/results.md, measured on this machine.
 
 use crate::report::Report;
-use crate::{assign, cluster, env, goals, runs, soak, tasks, training, update};
+use crate::{assign, cluster, endless, env, goals, messages, powers, runs, soak, tasks, training, update};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use magex::failure;
 use magex::options::CommonOptions;
@@ -50,10 +50,14 @@ enum What {
     Assign(assign::AssignArgs),
     /// Cost of the commander's assignments over the exact ones.
     Commander(goals::CommanderArgs),
+    /// What powers of distances do to a team that moves, with a trained executor.
+    Powers(powers::PowersArgs),
     /// Train the paper's ranking commander alone, on instances of each layout.
     Ranking(goals::RankingArgs),
     /// Services with two actor processes against the same work in one process.
     Distributed(runs::DistributedArgs),
+    /// A mission on disk whose goals never end: memory and time of an update.
+    Endless(endless::EndlessArgs),
     /// Train and evaluate every size, executor and seed.
     Train(training::TrainArgs),
     /// Train and evaluate Push Ball and the drones.
@@ -62,19 +66,21 @@ enum What {
     Generalisation(runs::GeneralisationArgs),
     /// The learner's wire: throughput, many actors, weights to many subscribers, restart after a kill.
     Cluster(cluster::ClusterArgs),
+    /// Health checks of a commander beside messages of 31 MiB.
+    Messages(messages::MessagesArgs),
     /// Memory and open files of a training cluster over an hour.
     Soak(soak::SoakArgs),
     /// The learner process of `cluster`: only ingests.
     #[command(hide = true)]
     Ingest(cluster::IngestArgs),
-    /// All of these but soak.
+    /// All of these but soak, powers and endless.
     All,
 }
 
 /// The command lines that run without a subcommand.
 const QUICK: [&[&str]; 4] = [&["env"], &["update"], &["assign", "--solver"], &["commander"]];
 /// The command lines of `all`.
-const ALL: [&[&str]; 9] = [
+const ALL: [&[&str]; 10] = [
     &["env"],
     &["update"],
     &["assign"],
@@ -82,6 +88,7 @@ const ALL: [&[&str]; 9] = [
     &["ranking"],
     &["distributed"],
     &["cluster"],
+    &["messages"],
     &["train"],
     &["tasks"],
 ];
@@ -129,12 +136,15 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Update(args) => update::update(args),
         What::Assign(args) => assign::assign(args),
         What::Commander(args) => goals::commander(args),
+        What::Powers(args) => powers::powers(args),
         What::Ranking(args) => goals::ranking(args),
+        What::Endless(args) => endless::endless(args),
         What::Distributed(args) => runs::distributed(args),
         What::Train(args) => training::train(args),
         What::Tasks(args) => tasks::tasks(args),
         What::Generalisation(args) => runs::generalisation(args),
         What::Cluster(args) => cluster::cluster(args),
+        What::Messages(args) => messages::messages(args),
         What::Soak(args) => soak::soak(args),
         What::Ingest(_) | What::All => Err(anyhow::anyhow!("this is not a table")),
     }

@@ -6,9 +6,12 @@
 mod assign;
 mod cli;
 mod cluster;
+mod endless;
 mod env;
 mod fleet;
 mod goals;
+mod messages;
+mod powers;
 mod report;
 mod runs;
 mod soak;

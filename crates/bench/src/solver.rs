@@ -1,5 +1,7 @@
 //! Timings of the exact solver on uniform instances.
 
+pub(crate) mod limits;
+
 use crate::stats::quantile;
 use magex_assign::{AssignError, Solver, distances_into};
 use magex_core::rng::{Key, Purpose};

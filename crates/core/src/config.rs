@@ -104,6 +104,8 @@ pub enum CommanderPolicy {
     Ranking,
     /// Exact assignment (the paper's "Hungarian").
     Exact,
+    /// The shortest longest way; among those the smallest sum.
+    Makespan,
     /// The cheapest remaining pair of agent and goal, repeatedly.
     Greedy,
     /// Random assignment (the paper's ablation "w. RG").
@@ -114,6 +116,11 @@ impl CommanderPolicy {
     /// Whether the commander has weights that PPO trains.
     pub fn learned(self) -> bool {
         matches!(self, Self::Pairwise | Self::Ranking)
+    }
+
+    /// Whether it sums powers of distances.
+    pub fn knows_power(self) -> bool {
+        matches!(self, Self::Exact | Self::Makespan)
     }
 
     /// Whether the weights serve one team size only.
@@ -131,7 +138,7 @@ impl std::fmt::Display for CommanderPolicy {
 impl std::str::FromStr for CommanderPolicy {
     type Err = UnknownName;
     fn from_str(text: &str) -> Result<Self, UnknownName> {
-        let choices = "pairwise, ranking, exact, greedy or random";
+        let choices = "pairwise, ranking, exact, makespan, greedy or random";
         Self::deserialize(text.into_deserializer()).map_err(|_: serde::de::value::Error| UnknownName {
             what: "scheduler",
             name: text.to_owned(),
@@ -157,6 +164,8 @@ section! {
     CommanderConfig {
         /// Goal scheduler.
         kind: CommanderPolicy = CommanderPolicy::Pairwise;
+        /// Exponent of the distances that the `exact` and `makespan` schedulers sum; 1 for the others.
+        power: f64 = 1.0, 1.0..=16.0;
         /// Hidden units per layer of the scheduler's network.
         hidden: usize = 32, 4..=1024;
         /// Canonical order of the `ranking` scheduler.
@@ -324,6 +333,13 @@ impl RunConfig {
             return Err(FieldError::new("task.reward_target", problem));
         }
         self.commander.check_ranges("commander")?;
+        let CommanderConfig { kind, power, .. } = self.commander;
+        if power != 1.0 && !kind.knows_power() {
+            let problem = format!(
+                "{power}, but the {kind} scheduler has no power; use 1, or commander.kind = \"exact\" or \"makespan\""
+            );
+            return Err(FieldError::new("commander.power", problem));
+        }
         self.mappo.check_ranges("mappo")?;
         let (features, chunk, horizon) =
             (self.executor.feature_size, self.mappo.chunk_length, self.task.horizon as usize);

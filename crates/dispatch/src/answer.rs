@@ -1,8 +1,10 @@
 //! Writes a plan as a response.
 
 use crate::UNASSIGNED;
+use crate::costs::{Obstacle, PairTerms};
 use crate::engine::Plan;
 use crate::problem::Problem;
+use magex_assign::compensated_sum;
 use magex_proto::v1;
 
 /// A plan and its origin.
@@ -34,8 +36,12 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
         exact_cost: plan.exact_cost,
         gap: gap(plan.cost, plan.exact_cost),
         scheduler: v1::AssignmentMethod::from(plan.scheduler).into(),
+        unserved_cost: plan.unserved_cost,
         ..Default::default()
     };
+    let timed = problem.terms.timed();
+    // Without words of their own, costs are distances.
+    let plain = problem.terms.plain() && problem.matrix.is_none() && problem.overrides.is_empty();
     let mut free = vec![true; g];
     let mut largest: Option<f64> = None;
     for (agent, &goal) in plan.goal_of.iter().enumerate() {
@@ -44,12 +50,11 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
             continue;
         }
         free[goal as usize] = false;
-        let cost = plan.pair_costs[agent];
+        let PairTerms { cost, arrival } = plan.pairs[agent];
         largest = Some(largest.map_or(cost, |top| top.max(cost)));
-        let distance = match problem.matrix.is_none() && problem.overrides.is_empty() {
-            true => cost,
-            false => problem.distance(agent, goal as usize),
-        };
+        let distance = if plain { cost } else { problem.distance(agent, goal as usize) };
+        let arrival = timed.then_some(arrival);
+        response.last_arrival = response.last_arrival.map_or(arrival, |last| arrival.map(|arrival| arrival.max(last)));
         response.pairs.push(v1::Pair {
             agent_index: agent as u32,
             goal_index: goal,
@@ -58,13 +63,17 @@ pub fn write(problem: &Problem, plan: &Plan) -> v1::AssignResponse {
             distance,
             probability: plan.probabilities.as_ref().and_then(|p| p.get(agent).copied().flatten()),
             cost,
+            arrival,
         });
     }
     response.largest_cost = largest.unwrap_or(0.0);
+    response.distance =
+        if plain { plan.cost } else { compensated_sum(response.pairs.iter().map(|pair| pair.distance)) };
     response.unassigned_goals.extend((0..g as u32).filter(|&goal| free[goal as usize]));
-    let [agents, goals] = &plan.isolated;
-    response.agents_without_goal = reasons(&response.unassigned_agents, &problem.agent_ids, agents, n > g);
-    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, goals, g > n);
+    let [agents, goals] = &plan.obstacles;
+    let places = problem.place_count();
+    response.agents_without_goal = reasons(&response.unassigned_agents, &problem.agent_ids, agents, n > places);
+    response.goals_without_agent = reasons(&response.unassigned_goals, &problem.goal_ids, goals, places > n);
     let left = |(now, then): (&u32, &u32)| *then != UNASSIGNED && now != then;
     response.switches = plan.goal_of.iter().zip(&problem.current).filter(|pair| left(*pair)).count() as u32;
     response
@@ -84,11 +93,13 @@ fn name(ids: &[String], index: usize) -> String {
     ids.get(index).cloned().unwrap_or_default()
 }
 
-fn reasons(left: &[u32], ids: &[String], isolated: &[u32], outnumbered: bool) -> Vec<v1::Unassigned> {
-    let reason = |index: &u32| match isolated.binary_search(index) {
-        Ok(_) => v1::UnassignedReason::Forbidden,
-        Err(_) if outnumbered => v1::UnassignedReason::Outnumbered,
-        Err(_) => v1::UnassignedReason::Conflict,
+fn reasons(left: &[u32], ids: &[String], obstacles: &[Option<Obstacle>], outnumbered: bool) -> Vec<v1::Unassigned> {
+    let reason = |index: &u32| match obstacles.get(*index as usize).copied().flatten() {
+        Some(Obstacle::Forbidden) => v1::UnassignedReason::Forbidden,
+        Some(Obstacle::Late) => v1::UnassignedReason::TooLate,
+        Some(Obstacle::NotOpen) => v1::UnassignedReason::NotOpen,
+        None if outnumbered => v1::UnassignedReason::Outnumbered,
+        None => v1::UnassignedReason::Conflict,
     };
     left.iter()
         .map(|index| v1::Unassigned { index: *index, id: name(ids, *index as usize), reason: reason(index).into() })

@@ -1,14 +1,18 @@
 //! Missions on disk: one redb file, one row per mission; every change is durable before it is acknowledged.
 //!
 //! After a failed write the database rejects all further writes, and it is unknown whether the failed write is in the file. So
-//! before the next write the file is reopened and made equal to the missions in memory, which are the acknowledged ones.
+//! before the next write the file is reopened and made equal to the missions in memory, which are the acknowledged ones. The same
+//! happens when the file was removed, moved or replaced: the open one would take writes that no restart finds.
+
+pub(crate) mod data_file;
 
 use crate::clock::Mark;
 use crate::mission::Mission;
+use data_file::DataFile;
 use redb::{Database, ReadableDatabase as _, ReadableTable as _, TableDefinition, TableError};
 use std::collections::{BTreeMap, HashSet};
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -19,9 +23,7 @@ const ABOUT: TableDefinition<'_, &str, u64> = TableDefinition::new("about");
 /// Names of the parts of a [`Mark`] there, in its order.
 const MARK: [&str; 4] = ["clock_ms", "boot_ms", "boot", "day_ms"];
 /// Format of the records; a file with another one is rejected.
-const FORMAT: u64 = 2;
-/// Page cache, bytes: small, because the missions themselves are in memory.
-const CACHE: usize = 4 << 20;
+const FORMAT: u64 = 3;
 /// Pause after a failed write before the file is reopened: opening reads all of it.
 pub const PAUSE: Duration = Duration::from_secs(1);
 
@@ -40,6 +42,9 @@ pub enum DiskError {
     /// A record is damaged.
     #[error("the record of mission '{0}' is damaged: {1}")]
     Record(String, String),
+    /// Another program removed, moved or replaced the file, again and again.
+    #[error("another program removed or replaced the file while it was written")]
+    Gone,
     /// The last write failed less than [`PAUSE`] ago.
     #[error("the last write failed; the file is reopened at the first change after {PAUSE:?}")]
     Paused,
@@ -58,6 +63,7 @@ fn other_format(format: &u64) -> String {
     let own = env!("CARGO_PKG_VERSION");
     match format {
         1 => format!("written by magex 0.1.0 (commit 389f705), which reads it; this is magex {own}"),
+        2 => format!("written by magex 0.2.0 (commit 3cfb71e or before), which reads it; this is magex {own}"),
         other => format!("its format is {other}; this is magex {own}, which reads format {FORMAT}"),
     }
 }
@@ -68,9 +74,15 @@ pub(crate) type Kept = BTreeMap<String, Arc<Mission>>;
 /// Opens or creates the database.
 type Opener = Box<dyn Fn() -> Result<Database, redb::Error> + Send + Sync>;
 
+/// Where the database is.
+enum Place {
+    File(DataFile),
+    Elsewhere(Opener),
+}
+
 /// The file.
 pub struct Disk {
-    opener: Opener,
+    place: Place,
     /// `None` after a failed write.
     database: Option<Database>,
     /// Time of the last failed write.
@@ -78,6 +90,36 @@ pub struct Disk {
     pause: Duration,
     /// The clock at the next change.
     mark: Mark,
+}
+
+impl Place {
+    /// Opens or creates the database, and does `first` to it before anything else.
+    fn open(&mut self, first: impl Fn(&Database) -> Result<(), DiskError>) -> Result<Database, DiskError> {
+        match self {
+            Self::File(file) => file.open(first),
+            Self::Elsewhere(opener) => {
+                let database = opener()?;
+                first(&database)?;
+                Ok(database)
+            }
+        }
+    }
+
+    fn is_there(&self) -> bool {
+        match self {
+            Self::File(file) => file.is_there(),
+            Self::Elsewhere(_) => true,
+        }
+    }
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File(file) => write!(f, "{}", file.path().display()),
+            Self::Elsewhere(_) => f.write_str("memory"),
+        }
+    }
 }
 
 impl fmt::Debug for Disk {
@@ -89,16 +131,17 @@ impl fmt::Debug for Disk {
 impl Disk {
     /// Opens or creates the file. Fails if it cannot be opened, is in use, or has another format.
     pub fn open(path: &Path) -> Result<Self, DiskError> {
-        let path: PathBuf = path.to_owned();
-        let opener = move || Ok(Database::builder().set_cache_size(CACHE).create(&path)?);
-        Self::opened_by(Box::new(opener), PAUSE)
+        Self::at(Place::File(DataFile::new(path)), PAUSE)
     }
 
     /// The same with any database, which is reopened at the earliest `pause` after a failed write.
     pub fn opened_by(opener: Opener, pause: Duration) -> Result<Self, DiskError> {
-        let database = opener()?;
-        prepare(&database)?;
-        Ok(Self { opener, database: Some(database), failed: None, pause, mark: Mark::default() })
+        Self::at(Place::Elsewhere(opener), pause)
+    }
+
+    fn at(mut place: Place, pause: Duration) -> Result<Self, DiskError> {
+        let database = place.open(prepare)?;
+        Ok(Self { place, database: Some(database), failed: None, pause, mark: Mark::default() })
     }
 
     /// All missions, by name. Fails if a record is damaged.
@@ -135,29 +178,52 @@ impl Disk {
     /// Writes and removes missions in one durable transaction. `kept` are all acknowledged missions.
     /// After a failed write nothing has changed for clients, and the file is reopened before the next change.
     pub fn change(&mut self, put: &[&Mission], remove: &[&str], kept: &Kept) -> Result<(), DiskError> {
-        // A failed write drops the database, which closes the file, so that it can be reopened.
-        let database = match self.database.take() {
-            Some(database) => Ok(database),
-            None if self.failed.is_some_and(|since| since.elapsed() < self.pause) => return Err(DiskError::Paused),
-            None => self.reopen(kept),
-        };
-        let mark = &self.mark;
-        let written = database.and_then(|database| write(&database, put, remove, mark).map(|()| database));
-        match written {
-            Ok(database) => self.database = Some(database),
-            Err(error) => {
-                self.failed = Some(Instant::now());
-                return Err(error);
-            }
-        }
-        Ok(())
+        self.with_file(kept, |database, mark| write(database, put, remove, mark))
     }
 
-    fn reopen(&self, kept: &Kept) -> Result<Database, DiskError> {
-        let database = (self.opener)()?;
-        prepare(&database)?;
-        mirror(&database, kept, &self.mark)?;
-        Ok(database)
+    /// Writes a file that another program removed, moved or replaced again, without waiting for a change.
+    pub fn tend(&mut self, kept: &Kept) -> Result<(), DiskError> {
+        if self.database.is_some() && !self.place.is_there() { self.with_file(kept, |_, _| Ok(())) } else { Ok(()) }
+    }
+
+    /// Runs `action` on the open file, and once more on a new one if it is not the file at the path.
+    fn with_file(
+        &mut self,
+        kept: &Kept,
+        action: impl Fn(&Database, &Mark) -> Result<(), DiskError>,
+    ) -> Result<(), DiskError> {
+        for _ in 0..2 {
+            // A failed write drops the database, which closes the file, so that it can be reopened.
+            let database = match self.database.take() {
+                Some(database) => Ok(database),
+                None if self.failed.is_some_and(|since| since.elapsed() < self.pause) => return Err(DiskError::Paused),
+                None => self.reopen(kept),
+            };
+            match database.and_then(|database| action(&database, &self.mark).map(|()| database)) {
+                // What was written is there only if the file is.
+                Ok(database) if self.place.is_there() => {
+                    self.database = Some(database);
+                    return Ok(());
+                }
+                Ok(_) => tracing::error!(
+                    file = %self.place, "the file of the missions was removed, moved or replaced; writing all of it again"
+                ),
+                Err(error) => {
+                    self.failed = Some(Instant::now());
+                    return Err(error);
+                }
+            }
+        }
+        self.failed = Some(Instant::now());
+        Err(DiskError::Gone)
+    }
+
+    fn reopen(&mut self, kept: &Kept) -> Result<Database, DiskError> {
+        let mark = &self.mark;
+        self.place.open(|database| {
+            prepare(database)?;
+            mirror(database, kept, mark)
+        })
     }
 }
 

@@ -1,15 +1,19 @@
 //! Solves a team's problem by every method but the learned one, and checks the answer of the learned one.
 //!
-//! Switching cost: the current pair of an agent is cheaper by s. The exact solution of these costs minimises
-//! (summed cost) + s · (number of agents that leave their pair). Pairs are not exchanged for equally cheap ones, even with s = 0.
+//! Switching cost: exact and makespan minimise (summed cost) + s · (number of agents that leave their pair), then that number: pairs
+//! are not exchanged for equally cheap ones, even with s = 0. For greedy the current pair of an agent is cheaper by s.
 //! The learned method ignores current pairs: of its answer, only changes that save more than their switching costs are applied.
 
 mod sticky;
 
 use crate::UNASSIGNED;
+use crate::costs::{Obstacle, PairTerms};
 use crate::problem::Problem;
 use magex_assign::random::random_allowed;
-use magex_assign::{AssignError, BottleneckSolver, Solver, cost_of, greedy, pairs};
+use magex_assign::{
+    AssignError, BottleneckSolver, PointProblem, Solver, Switching, bottleneck_points, compensated_sum, greedy, pairs,
+    solve_points,
+};
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use std::cell::RefCell;
@@ -33,10 +37,12 @@ pub struct Plan {
     pub cost: f64,
     /// Smallest possible summed cost, if it was computed in time and the answer has as many pairs.
     pub exact_cost: Option<f64>,
-    /// `[N]` cost of each agent's pair; 0 without one.
-    pub pair_costs: Vec<f64>,
-    /// Agents, and goals, whose pairs are all forbidden, ascending.
-    pub isolated: [Vec<u32>; 2],
+    /// The part of the cost that is of goals without an agent; 0 unless weights differ.
+    pub unserved_cost: f64,
+    /// `[N]` cost and arrival of each agent's pair; 0 without one.
+    pub pairs: Vec<PairTerms>,
+    /// What stands in the way of every agent, and of every goal; empty if nothing does.
+    pub obstacles: [Vec<Option<Obstacle>>; 2],
 }
 
 /// Buffers that are reused from problem to problem.
@@ -46,6 +52,8 @@ struct Workspace {
     makespan: BottleneckSolver,
     costs: Vec<f64>,
     adjusted: Vec<f64>,
+    /// Costs without weights.
+    unweighted: Vec<f64>,
 }
 
 thread_local! {
@@ -73,37 +81,108 @@ pub fn solve(
     if problem.cells() == 0 {
         return Ok(nothing(problem, kind));
     }
+    if matches!(kind, AssignmentMethod::Exact | AssignmentMethod::Learned | AssignmentMethod::Makespan)
+        && problem.cells() > KEPT_CELLS
+        && let Some(costs) = problem.without_matrix()
+    {
+        return solve_large(problem, kind, &costs, should_continue);
+    }
     with_workspace(problem, |workspace| {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
-        problem.costs_into(&mut workspace.costs)?;
-        let sticky = workspace.adjust(problem);
-        let Workspace { solver, makespan, costs, adjusted } = workspace;
-        let target: &[f64] = if sticky { adjusted } else { costs };
-        let mut exact_cost = None;
-        let (goal_of, scheduler) = match kind {
+        let (rows, cols) = (problem.agent_count, problem.place_count());
+        problem.costs_into(&mut workspace.costs);
+        let current = problem.current_places();
+        let switching = Switching { current: &current, cost: problem.switching_cost };
+        let sticky = sticky(problem);
+        let (place_of, scheduler) = match kind {
             AssignmentMethod::Exact | AssignmentMethod::Learned => {
-                let answer = solver.solve_allowed(target, rows, cols, should_continue)?;
-                exact_cost = (!sticky).then_some(answer.cost);
+                let Workspace { solver, costs, .. } = workspace;
+                let answer = solver.solve_switching(costs, rows, cols, &switching, should_continue)?;
                 (answer.col_of_row, AssignmentMethod::Exact)
             }
-            AssignmentMethod::Makespan => {
-                (makespan.solve_allowed(target, rows, cols, should_continue)?.col_of_row, kind)
+            AssignmentMethod::Makespan if problem.terms.weighted() => {
+                let Workspace { solver, makespan, costs, unweighted, .. } = workspace;
+                problem.unweighted_into(unweighted);
+                let first = makespan.solve_switching(unweighted, rows, cols, &switching, should_continue)?;
+                let leaves = |row: usize, col: usize| {
+                    let left = current.get(row).is_some_and(|&own| own != UNASSIGNED && own as usize != col);
+                    if left { problem.switching_cost } else { 0.0 }
+                };
+                let key = |row: usize, col: usize| unweighted[row * cols + col] + leaves(row, col);
+                let largest = first.pairs().map(|(row, col)| key(row, col)).fold(f64::NEG_INFINITY, f64::max);
+                for (place, cost) in costs.iter_mut().enumerate() {
+                    if key(place / cols, place % cols) > largest {
+                        *cost = f64::INFINITY;
+                    }
+                }
+                (solver.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
             }
-            AssignmentMethod::Greedy => (greedy(target, rows, cols, should_continue)?.col_of_row, kind),
+            AssignmentMethod::Makespan => {
+                let Workspace { makespan, costs, .. } = workspace;
+                (makespan.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
+            }
+            AssignmentMethod::Greedy => {
+                let adjusted = workspace.adjust(problem);
+                let target = if adjusted { &workspace.adjusted } else { &workspace.costs };
+                (greedy(target, rows, cols, should_continue)?.col_of_row, kind)
+            }
             AssignmentMethod::Random => {
                 let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                (random_allowed(costs, rows, cols, &mut stream, should_continue)?, kind)
+                (random_allowed(&workspace.costs, rows, cols, &mut stream, should_continue)?, kind)
             }
         };
-        workspace.finish(problem, Plan { goal_of, scheduler, exact_cost, ..Plan::default() }, should_continue)
+        let proven = scheduler == AssignmentMethod::Exact && !sticky;
+        let plan = Plan { goal_of: goals_of(problem, place_of), scheduler, ..Plan::default() };
+        workspace.finish(problem, plan, proven, should_continue)
     })
+}
+
+/// Whether agents have current goals.
+fn sticky(problem: &Problem) -> bool {
+    problem.current.iter().any(|&goal| goal != UNASSIGNED)
+}
+
+/// Solves a large team of positions without a matrix. `costs` are pairs that cost something else.
+fn solve_large(
+    problem: &Problem,
+    kind: AssignmentMethod,
+    costs: &[(u32, u32, f64)],
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Plan, AssignError> {
+    let Problem { agents, goals, dims, .. } = problem;
+    let switching = Switching { current: &problem.current, cost: problem.switching_cost };
+    let own = PointProblem { power: problem.terms.power, costs, ..PointProblem::new(agents, goals, *dims) };
+    let with_current = PointProblem { switching, ..own };
+    let (answer, scheduler) = match kind {
+        AssignmentMethod::Makespan => (bottleneck_points(&with_current, should_continue)?, kind),
+        _ => (solve_points(&with_current, should_continue)?, AssignmentMethod::Exact),
+    };
+    let proven = scheduler == AssignmentMethod::Exact && !sticky(problem);
+    let pairs_of = answer.pairs().count();
+    let mut plan = Plan { goal_of: answer.col_of_row, scheduler, ..Plan::default() };
+    plan.pairs = problem.pair_terms(&plan.goal_of);
+    plan.cost = total(&plan.pairs, 0.0);
+    if proven {
+        plan.exact_cost = Some(plan.cost);
+    } else if problem.cells() <= GAP_CELLS {
+        match solve_points(&own, should_continue) {
+            Ok(exact) if exact.pairs().count() == pairs_of => {
+                plan.exact_cost = Some(total(&problem.pair_terms(&exact.col_of_row), 0.0));
+            }
+            Ok(_) | Err(AssignError::Interrupted) => {}
+            Err(other) => return Err(other),
+        }
+    }
+    if problem.forbids() && pairs_of < problem.agent_count.max(problem.goal_count) {
+        plan.obstacles = problem.obstacles();
+    }
+    Ok(plan)
 }
 
 /// The plan of a team without agents or without goals: all others are left over, at no cost, whatever the method.
 fn nothing(problem: &Problem, kind: AssignmentMethod) -> Plan {
     let scheduler = if kind == AssignmentMethod::Learned { AssignmentMethod::Exact } else { kind };
-    let (goal_of, pair_costs) = (vec![UNASSIGNED; problem.agent_count], vec![0.0; problem.agent_count]);
-    Plan { goal_of, scheduler, exact_cost: Some(0.0), pair_costs, ..Plan::default() }
+    let (goal_of, pairs) = (vec![UNASSIGNED; problem.agent_count], vec![PairTerms::default(); problem.agent_count]);
+    Plan { goal_of, scheduler, exact_cost: Some(0.0), pairs, ..Plan::default() }
 }
 
 /// Makes a plan of the answer of the learned method. An error is the reason of a fallback.
@@ -117,7 +196,7 @@ pub fn adopt(
     let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
     with_workspace(problem, |workspace| {
         let cols = problem.goal_count;
-        problem.costs_into(&mut workspace.costs).map_err(|error| error.to_string())?;
+        problem.costs_into(&mut workspace.costs);
         let costs = &workspace.costs;
         if let Some((agent, goal)) = pairs(&wish).find(|(agent, goal)| costs[agent * cols + goal] == f64::INFINITY) {
             return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
@@ -129,8 +208,13 @@ pub fn adopt(
 
 /// Why the learned method does not support a problem.
 pub fn not_for_learned(problem: &Problem) -> Option<&'static str> {
-    if problem.matrix.is_some() || !problem.overrides.is_empty() {
+    if problem.matrix.is_some() || problem.only_overrides || !problem.overrides.is_empty() {
         return Some("the learned scheduler supports positions only, not costs");
+    }
+    if !problem.terms.plain() {
+        return Some(
+            "the learned scheduler knows distances only: no power, speeds, offsets, weights, capacities or times",
+        );
     }
     if problem.cells() == 0 {
         return Some("without agents or without goals there is nothing to choose");
@@ -163,66 +247,85 @@ impl Workspace {
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
         let scheduler = AssignmentMethod::Learned;
-        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, should_continue)
+        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, false, should_continue)
     }
 
     /// Fills the adjusted costs if there are current pairs.
     fn adjust(&mut self, problem: &Problem) -> bool {
         let Self { costs, adjusted, .. } = self;
-        let cols = problem.goal_count;
-        if problem.current.iter().all(|&goal| goal == UNASSIGNED) {
+        if !sticky(problem) {
             return false;
         }
         adjusted.clear();
         adjusted.extend_from_slice(costs);
-        sticky::favour(adjusted, cols, &problem.current, problem.switching_cost);
+        favour(adjusted, problem.place_count(), problem);
         true
     }
 
-    /// Fills in the costs of a matching.
+    /// Fills in the costs of a matching. `proven`: no other costs less.
     fn finish(
         &mut self,
         problem: &Problem,
         mut plan: Plan,
+        proven: bool,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<Plan, AssignError> {
-        let (rows, cols) = (problem.agent_count, problem.goal_count);
+        let (rows, cols) = (problem.agent_count, problem.place_count());
         let Self { solver, costs, .. } = self;
-        plan.cost = cost_of(costs, cols, &plan.goal_of);
-        if plan.exact_cost.is_none() && rows * cols <= GAP_CELLS {
+        let longest = if problem.terms.weighted() { problem.costs_into(costs) } else { 0.0 };
+        plan.pairs = problem.pair_terms(&plan.goal_of);
+        plan.unserved_cost = unserved(problem, longest, &plan.goal_of);
+        plan.cost = total(&plan.pairs, plan.unserved_cost);
+        if proven {
+            plan.exact_cost = Some(plan.cost);
+        } else if rows * cols <= GAP_CELLS {
             match solver.solve_allowed(costs, rows, cols, should_continue) {
                 Ok(exact) if exact.pairs().count() == pairs(&plan.goal_of).count() => {
-                    plan.exact_cost = Some(exact.cost)
+                    let goal_of = goals_of(problem, exact.col_of_row);
+                    let cost = total(&problem.pair_terms(&goal_of), unserved(problem, longest, &goal_of));
+                    plan.exact_cost = Some(cost);
                 }
                 // The answer is complete; only its gap is missing.
                 Ok(_) | Err(AssignError::Interrupted) => {}
                 Err(other) => return Err(other),
             }
         }
-        plan.pair_costs = vec![0.0; rows];
-        pairs(&plan.goal_of).for_each(|(agent, goal)| plan.pair_costs[agent] = costs[agent * cols + goal]);
-        if !problem.forbidden.is_empty() {
-            plan.isolated = isolated(costs, cols);
+        if problem.forbids() && pairs(&plan.goal_of).count() < rows.max(problem.goal_count) {
+            plan.obstacles = problem.obstacles();
         }
         Ok(plan)
     }
 }
 
-/// Agents, and goals, whose pairs are all forbidden.
-fn isolated(costs: &[f64], cols: usize) -> [Vec<u32>; 2] {
-    let (mut agents, mut lonely) = (Vec::new(), vec![true; cols]);
-    for (agent, row) in (0u32..).zip(costs.chunks_exact(cols)) {
-        let mut allowed = false;
-        for (cost, lonely) in row.iter().zip(&mut lonely) {
-            if *cost < f64::INFINITY {
-                (allowed, *lonely) = (true, false);
-            }
-        }
-        if !allowed {
-            agents.push(agent);
+/// Makes the current pairs cheaper.
+fn favour(costs: &mut [f64], cols: usize, problem: &Problem) {
+    sticky::favour(costs, cols, &problem.current_places(), problem.switching_cost);
+}
+
+/// The goal of each agent's place.
+fn goals_of(problem: &Problem, mut place_of: Vec<u32>) -> Vec<u32> {
+    if let Some(places) = problem.places() {
+        for place in place_of.iter_mut().filter(|place| **place != UNASSIGNED) {
+            *place = places[*place as usize];
         }
     }
-    [agents, (0u32..).zip(lonely).filter_map(|(goal, lonely)| lonely.then_some(goal)).collect()]
+    place_of
+}
+
+fn total(pairs: &[PairTerms], unserved: f64) -> f64 {
+    compensated_sum(pairs.iter().map(|pair| pair.cost).chain([unserved]))
+}
+
+/// What the places cost that no agent gets, at `longest` per unit of weight.
+fn unserved(problem: &Problem, longest: f64, goal_of: &[u32]) -> f64 {
+    if longest == 0.0 {
+        return 0.0;
+    }
+    let terms = &problem.terms;
+    let mut free: Vec<u32> =
+        (0..problem.goal_count).map(|goal| terms.capacity(goal).min(problem.agent_count as u32)).collect();
+    pairs(goal_of).for_each(|(_, goal)| free[goal] -= 1);
+    compensated_sum((0..problem.goal_count).map(|goal| f64::from(free[goal]) * terms.weight(goal) * longest))
 }
 
 /// Checks that the answer is a matching of min(N, G) pairs.

@@ -85,6 +85,11 @@ impl WriteState {
         }
     }
 
+    /// Writes a file again that was removed or replaced.
+    fn tend(&mut self, kept: &Kept) -> Result<(), KeepError> {
+        self.disk.as_mut().map_or(Ok(()), |disk| Ok(disk.tend(kept)?))
+    }
+
     /// Sets the size of a mission; `None` when it is removed. A mission never changes its owner.
     fn resize(&mut self, mission: &Mission, size: Option<usize>) {
         let (id, owner) = (mission.id(), mission.assignment.owner.as_str());
@@ -209,11 +214,12 @@ impl Missions {
         Ok(mission)
     }
 
-    /// Deletes the missions that have expired, and returns them.
+    /// Deletes the missions that have expired, and returns them. Called often: a file that was removed is written again.
     pub fn expire(&self, now: impl Into<Now>) -> Result<Vec<Arc<Mission>>, KeepError> {
         let (mut writing, now) = (self.lock(), now.into());
         let old: Vec<Arc<Mission>> = self.read().values().filter(|mission| mission.expired(&now)).cloned().collect();
         if old.is_empty() {
+            writing.tend(&self.read())?;
             return Ok(old);
         }
         let ids: Vec<&str> = old.iter().map(|mission| mission.id()).collect();

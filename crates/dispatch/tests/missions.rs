@@ -19,12 +19,12 @@ fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }
 
-fn member(id: &str, position: &[f32]) -> v1::Member {
-    v1::Member { id: id.into(), position: position.to_vec(), state: 0 }
+fn member(id: &str, position: &[f64]) -> v1::Member {
+    v1::Member { id: id.into(), position: position.to_vec(), ..Default::default() }
 }
 
 fn state(id: &str, state: MemberState) -> v1::Member {
-    v1::Member { id: id.into(), position: Vec::new(), state: state.into() }
+    v1::Member { id: id.into(), state: state.into(), ..Default::default() }
 }
 
 fn pair(agent: &str, goal: &str) -> v1::PairRef {
@@ -87,7 +87,9 @@ fn agents_keep_their_goals_unless_leaving_them_is_worth_it() {
     assert_eq!(reasons(&crossed), [("a", ChangeReason::Switched), ("b", ChangeReason::Switched)]);
     assert!((crossed.assignment.saving.unwrap() - 0.8).abs() < 1e-5);
     assert!((crossed.assignment.changes[0].gain.unwrap() - 0.4).abs() < 1e-5);
-    assert!(crossed.assignment.changes[0].explanation.contains("saves 0.8"));
+    assert!(
+        crossed.assignment.changes[0].explanation.contains("fall by 0.8000, more than 2 x the switching cost of 0.3")
+    );
 }
 
 #[test]
@@ -153,7 +155,7 @@ fn wrong_fields_are_named() {
     created(|m| m.agents[1].id.clear(), "agents[1].id: 0 bytes");
     created(|m| m.agents[1].position.clear(), "agents[1].position: 0 coordinates");
     created(|m| m.goals[0].position = vec![0.0; 3], "goals[0].position: 3 coordinates, but other members have 2");
-    created(|m| m.goals[0].position[1] = f32::NAN, "goals[0].position[1]: NaN");
+    created(|m| m.goals[0].position[1] = f64::NAN, "goals[0].position[1]: NaN");
     created(|m| m.goals[0].state = 9, "goals[0].state: 9");
     created(|m| m.scheduler = v1::AssignmentMethod::Random.into(), "scheduler: random is not allowed");
     created(|m| m.switching_cost = f64::INFINITY, "switching_cost: inf");
@@ -162,7 +164,7 @@ fn wrong_fields_are_named() {
     created(|m| m.forbidden = vec![v1::PairRef::default()], "forbidden[0].agent_id: missing; pairs of a mission");
     created(
         |m| m.agents = (0..21).map(|k| member(&k.to_string(), &[0.0, 0.0])).collect(),
-        "agents[20].id: a mission has at most 20",
+        "agents: a mission has at most 20 agents that are not finished",
     );
     created(|m| m.forbidden = vec![pair("a", "z"); 201], "forbidden: 201 entries exceed the limit of 200");
     let mission = start(0.0);
@@ -303,7 +305,7 @@ proptest! {
             let members = |side: &str, list: &[(u8, i8, i8, i32)]| -> Vec<v1::Member> {
                 list.iter()
                     .map(|&(k, x, y, state)| v1::Member {
-                        id: format!("{side}{k}"), position: vec![f32::from(x), f32::from(y)], state,
+                        id: format!("{side}{k}"), position: vec![f64::from(x), f64::from(y)], state, ..Default::default()
                     })
                     .collect()
             };

@@ -16,11 +16,11 @@ fn limits() -> Limits {
     Limits { members: 12, teams: 3 }
 }
 
-fn positions(dims: u32, coordinates: &[f32]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims, coordinates: coordinates.to_vec(), array: None })
+fn positions(dims: u32, coordinates: &[f64]) -> Option<v1::Positions> {
+    Some(v1::Positions { dims, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
-fn team(agents: &[f32], goals: &[f32]) -> v1::AssignRequest {
+fn team(agents: &[f64], goals: &[f64]) -> v1::AssignRequest {
     v1::AssignRequest { agents: positions(2, agents), goals: positions(2, goals), ..Default::default() }
 }
 
@@ -97,7 +97,7 @@ fn a_team_without_agents_or_without_goals_is_answered_and_the_others_are_left_ov
     let (two, none) = ([0.0, 0.0, 1.0, 0.0], [0.0; 0]);
     let packed = |rows: usize, dims: usize| {
         let values = vec![0.5; rows * dims];
-        Some(v1::Positions { array: Some(arrays::from_f32(&[rows, dims], &values)), ..Default::default() })
+        Some(v1::Positions { array: Some(arrays::from_f64(&[rows, dims], &values)), ..Default::default() })
     };
     let costs = |agents, goals| v1::AssignRequest {
         costs: Some(v1::CostMatrix { agents, goals, values: vec![] }),
@@ -159,11 +159,15 @@ fn wrong_fields_are_named() {
     check(|m| m.goals = None, "goals: missing");
     check(|m| m.goals = positions(0, &[1.0]), "goals.dims: 0");
     check(|m| m.goals = positions(2, &[1.0]), "goals.coordinates: 1 numbers");
+    check(
+        |m| m.agents = Some(v1::Positions { dims: 2, single_coordinates: vec![1.0, 2.0], ..Default::default() }),
+        "agents.single_coordinates: coordinates in single precision",
+    );
     check(|m| m.goals = positions(4, &[1.0; 4]), "goals.dims: 4");
     check(|m| m.goals = positions(3, &[1.0; 3]), "goals: 3 dimensions, the agents have 2");
     check(|m| m.goals = positions(2, &[0.0; 26]), "goals: 13 points exceed the limit of 12");
-    check(|m| m.agents = positions(2, &[1.0, f32::NAN]), "agents.coordinates[1]: NaN");
-    check(|m| m.agents = positions(2, &[f32::INFINITY, 0.0]), "agents.coordinates[0]: inf");
+    check(|m| m.agents = positions(2, &[1.0, f64::NAN]), "agents.coordinates[1]: NaN");
+    check(|m| m.agents = positions(2, &[f64::INFINITY, 0.0]), "agents.coordinates[0]: inf");
     check(|m| m.agent_ids = vec!["a".into()], "agent_ids: 1 names for 2");
     check(|m| m.agent_ids = vec!["a".into(), "a".into()], "agent_ids[1]: the same name as agent_ids[0]");
     check(|m| m.goal_ids = vec![String::new()], "goal_ids[0]: 0 bytes");
@@ -181,8 +185,8 @@ fn wrong_fields_are_named() {
     );
     check(|m| m.cost_overrides = vec![v1::PairCost { pair: None, cost: 1.0 }], "cost_overrides[0].pair: missing");
     check(
-        |m| m.cost_overrides = vec![v1::PairCost { pair: Some(by_index(0, 0)), cost: f64::INFINITY }],
-        "cost_overrides[0].cost: inf",
+        |m| m.cost_overrides = vec![v1::PairCost { pair: Some(by_index(0, 0)), cost: f64::NEG_INFINITY }],
+        "cost_overrides[0].cost: -inf",
     );
     let matrix = |agents, goals, values: &[f64]| Some(v1::CostMatrix { agents, goals, values: values.to_vec() });
     let check = |costs: Option<v1::CostMatrix>, words: &str| {
@@ -194,7 +198,9 @@ fn wrong_fields_are_named() {
     check(matrix(0, 1, &[]), "costs.agents: 0, but there are 1");
     check(matrix(1, u32::MAX, &[]), "costs.goals: 4294967295");
     check(matrix(1, 1, &[]), "costs.values: 0 numbers");
-    check(matrix(1, 1, &[1e101]), "costs.values[0]: 1");
+    check(matrix(1, 1, &[1e101]), "costs.values[0]: 1e101 is not a cost; use a number up to 1e100");
+    check(matrix(1, 1, &[f64::NAN]), "costs.values[0]: NaN");
+    check(matrix(1, 1, &[f64::NEG_INFINITY]), "costs.values[0]: -inf");
 }
 
 #[test]
@@ -215,7 +221,7 @@ fn a_model_that_gives_nonsense_is_found_out() {
 
 #[test]
 fn planning_stops_when_its_caller_is_gone() {
-    let coordinates: Vec<f32> = (0..24).map(|k| ((k * 37) % 23) as f32).collect();
+    let coordinates: Vec<f64> = (0..24).map(|k| ((k * 37) % 23) as f64).collect();
     let problem = read(team(&coordinates, &coordinates[2..]));
     let stopped = engine::solve(&problem, AssignmentMethod::Makespan, &|| false);
     assert_eq!(stopped, Err(AssignError::Interrupted));
@@ -243,12 +249,12 @@ fn every_plan(n: usize, g: usize, chosen: &mut Vec<u32>, visit: &mut impl FnMut(
     }
 }
 
-fn number() -> impl Strategy<Value = f32> {
+fn number() -> impl Strategy<Value = f64> {
     prop_oneof![
-        20 => -10.0f32..10.0,
-        4 => (-2i8..3).prop_map(f32::from),
-        1 => any::<f32>(),
-        1 => Just(f32::NAN),
+        20 => -10.0f64..10.0,
+        4 => (-2i8..3).prop_map(f64::from),
+        1 => any::<f64>(),
+        1 => Just(f64::NAN),
     ]
 }
 
@@ -313,6 +319,7 @@ fn request() -> impl Strategy<Value = v1::AssignRequest> {
                 deadline_seconds,
                 current,
                 switching_cost,
+                ..Default::default()
             }
         })
 }
@@ -335,7 +342,7 @@ proptest! {
         };
         let (n, g) = (problem.agent_count, problem.goal_count);
         let mut costs = Vec::new();
-        problem.costs_into(&mut costs).unwrap();
+        problem.costs_into(&mut costs);
         let allowed = |agent: usize, goal: usize| costs[agent * g + goal].is_finite();
         let mut most = 0;
         for kind in KINDS {
@@ -382,7 +389,7 @@ proptest! {
             ..Default::default()
         });
         let mut costs = Vec::new();
-        problem.costs_into(&mut costs).unwrap();
+        problem.costs_into(&mut costs);
         let score = |goal_of: &[u32]| {
             let mut pairs = 0usize;
             let mut sum = 0.0;

@@ -61,8 +61,8 @@ fn nothing_but_zeros_changes_nothing() {
     }
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 /// A model that sends agent k to goal k + 1.
@@ -112,7 +112,7 @@ fn an_agent_that_joins_a_learned_mission_moves_no_other_agent() {
     });
     let changes = swapped.unwrap().assignment.changes;
     assert_eq!(changes.len(), 2);
-    assert!(changes[0].explanation.contains("saves 2.0000, more than the switching cost of 0.5"), "{changes:?}");
+    assert!(changes[0].explanation.contains("fall by 2.0000, more than 2 x the switching cost of 0.5"), "{changes:?}");
 }
 
 #[test]
@@ -184,4 +184,29 @@ proptest! {
         prop_assert!(current.iter().all(|&(agent, goal)| kept[agent as usize] == goal), "{:?}", kept);
         prop_assert!(score(&plan.goal_of) <= score(&kept) + 1e-6, "never worse than keeping everything");
     }
+}
+
+#[test]
+fn break_even_changes_nothing_and_ties_go_to_the_lowest_index() {
+    let makespan = |problem: &Problem| engine::solve(problem, AssignmentMethod::Makespan, &|| true).unwrap().goal_of;
+    let kept = [
+        matrix(1, &[1.0, 2.0], &[(0, 1)], 1.0),
+        matrix(1, &[2.0, 1.0], &[(0, 0)], 1.0),
+        matrix(2, &[0.0, 1.0, 0.0, 3.0], &[(0, 0), (1, 1)], 1.0),
+        matrix(2, &[2.0, 1.0, 1.0, 2.0], &[(0, 0), (1, 1)], 1.0),
+        // The doubles of 0.3 and 0.1 + 0.2 differ, and it is the doubles that count: 0.3 - 0.1 < 0.2.
+        matrix(1, &[0.3, 0.1], &[(0, 0)], 0.2),
+    ];
+    for problem in &kept {
+        assert_eq!(exact(problem), problem.current, "{problem:?}");
+    }
+    // The largest costs are 2 and 1 + 1.
+    assert_eq!(makespan(&kept[3]), kept[3].current);
+    for ones in [matrix(2, &[1.0; 4], &[], 0.0), matrix(3, &[1.0; 9], &[], 0.0), matrix(3, &[1.0; 15], &[], 0.0)] {
+        let diagonal: Vec<u32> = (0..ones.agent_count as u32).collect();
+        assert_eq!((exact(&ones), makespan(&ones)), (diagonal.clone(), diagonal));
+    }
+    // A pair of 1e16 that cannot be avoided leaves the others their digits.
+    assert_eq!(exact(&matrix(2, &[1e16, 1e16, 0.9071, 0.9363], &[], 0.0)), [1, 0]);
+    assert_eq!(exact(&matrix(3, &[1e50, 1e50, 1e50, 1.0, 2.0, 9.0, 1.0, 4.0, 3.0], &[], 0.0)), [2, 1, 0]);
 }

@@ -24,8 +24,8 @@ fn planner(problem: &Problem) -> Result<Planned, AssignError> {
     Ok(Planned { plan, fallback_reason: String::new(), weights: None })
 }
 
-fn member(id: &str, x: f32) -> v1::Member {
-    v1::Member { id: id.into(), position: vec![x, 0.0], state: 0 }
+fn member(id: &str, x: f64) -> v1::Member {
+    v1::Member { id: id.into(), position: vec![x, 0.0], ..Default::default() }
 }
 
 fn make(id: &str, owner: &str) -> Mission {
@@ -58,7 +58,7 @@ fn one_owner_leaves_room_for_others() {
     let text = full(missions.insert(make("3", "me")));
     assert!(text.contains(&format!("one client may take {} bytes", 2 * one)), "{text}");
     // A mission does not grow beyond what it could have been made with, either.
-    let more: Vec<_> = (0..50).map(|k| member(&format!("more{k}"), k as f32)).collect();
+    let more: Vec<_> = (0..50).map(|k| member(&format!("more{k}"), k as f64)).collect();
     let larger = update(&second, v1::UpdateMissionRequest { agents: more, ..Default::default() });
     assert!(full(missions.replace(larger, 1)).contains("one client"));
     missions.insert(make("3", "you")).unwrap();
@@ -240,6 +240,75 @@ fn a_file_that_was_taken_away_is_written_again() {
     assert!(on_disk.iter().all(|mission| all[mission.id()] == *mission));
 }
 
+/// Every way in which another program takes the file away: after each, the next change is on disk with all that was acknowledged.
+#[test]
+fn a_removed_moved_or_replaced_file_is_noticed_with_the_next_change() {
+    let place = tempfile::tempdir().unwrap();
+    let (folder, away) = (place.path().join("data"), place.path().join("away"));
+    let path = folder.join("missions.redb");
+    std::fs::create_dir(&folder).unwrap();
+    let missions = Missions::open(Some(Disk::open(&path).unwrap()), Bounds::default()).unwrap();
+    missions.insert(make("kept", "me")).unwrap();
+    std::fs::copy(&path, place.path().join("backup")).unwrap();
+    let ways: [(&str, &dyn Fn()); 5] = [
+        ("the file is removed", &|| std::fs::remove_file(&path).unwrap()),
+        ("the folder is removed", &|| std::fs::remove_dir_all(&folder).unwrap()),
+        ("the folder is moved", &|| std::fs::rename(&folder, &away).unwrap()),
+        ("a backup is moved there", &|| std::fs::rename(place.path().join("backup"), &path).unwrap()),
+        ("something else is there", &|| {
+            std::fs::remove_file(&path).unwrap();
+            std::fs::write(&path, "no database").unwrap();
+        }),
+    ];
+    for (number, (what, way)) in ways.into_iter().enumerate() {
+        way();
+        missions.insert(make(&format!("m{number}"), "me")).unwrap_or_else(|error| panic!("{what}: {error}"));
+        // As after a kill at this moment.
+        let copy = place.path().join("copy");
+        std::fs::copy(&path, &copy).unwrap();
+        let on_disk = Disk::open(&copy).unwrap().load().unwrap();
+        assert_eq!(on_disk.len(), number + 2, "{what}");
+        std::fs::remove_file(copy).unwrap();
+    }
+    // What was in the way is kept: the backup can still be read.
+    let backup = Disk::open(&folder.join("missions.redb.found-1")).unwrap().load().unwrap();
+    assert_eq!(backup.len(), 1);
+    assert_eq!(std::fs::read_to_string(folder.join("missions.redb.found-2")).unwrap(), "no database");
+    // Without a change, the sweep notices.
+    std::fs::remove_dir_all(&folder).unwrap();
+    assert!(missions.expire(1000).unwrap().is_empty());
+    assert!(path.exists());
+    // Where nothing can be written, nothing is acknowledged, until it can.
+    std::fs::remove_dir_all(&folder).unwrap();
+    std::fs::write(&folder, "a file in the way").unwrap();
+    let error = missions.insert(make("late", "me")).unwrap_err();
+    assert!(matches!(error, KeepError::Disk(DiskError::Database(_))), "{error}");
+    assert!(missions.get("late").is_none());
+    std::fs::remove_file(&folder).unwrap();
+    std::thread::sleep(PAUSE);
+    missions.insert(make("late", "me")).unwrap();
+    missions.close();
+    assert_eq!(Disk::open(&path).unwrap().load().unwrap().len(), 7);
+}
+
+#[test]
+fn a_file_that_another_commander_uses_is_not_taken_from_it() {
+    let place = tempfile::tempdir().unwrap();
+    let (own, other) = (place.path().join("own.redb"), place.path().join("other.redb"));
+    let missions = Missions::open(Some(Disk::open(&own).unwrap()), Bounds::default()).unwrap();
+    let theirs = Missions::open(Some(Disk::open(&other).unwrap()), Bounds::default()).unwrap();
+    std::fs::rename(&other, &own).unwrap();
+    let error = missions.insert(make("1", "me")).unwrap_err();
+    assert!(matches!(error, KeepError::Disk(DiskError::InUse)), "{error}");
+    // The other one's file is gone from its path, so it is written there again.
+    theirs.insert(make("2", "you")).unwrap();
+    std::thread::sleep(PAUSE);
+    missions.insert(make("1", "me")).unwrap();
+    (missions.close(), theirs.close());
+    let names = |path| Disk::open(path).unwrap().load().unwrap().iter().map(|m| m.id().to_owned()).collect::<Vec<_>>();
+    assert_eq!((names(&own), names(&other)), (vec!["1".to_owned()], vec!["2".to_owned()]));
+}
+
 /// A small file system; unmounted when dropped.
 struct Mounted(tempfile::TempDir);
 
@@ -292,13 +361,13 @@ fn a_real_disk_that_was_full_is_used_again() {
 fn a_file_of_an_older_format_is_rejected_with_the_version_that_reads_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("missions.redb");
-    {
+    for (format, version) in [(1, "0.1.0 (commit 389f705)"), (2, "0.2.0 (commit 3cfb71e or before)")] {
         let about = redb::TableDefinition::<&str, u64>::new("about");
         let write = Database::create(&path).unwrap().begin_write().unwrap();
-        write.open_table(about).unwrap().insert("format", 1).unwrap();
+        write.open_table(about).unwrap().insert("format", format).unwrap();
         write.commit().unwrap();
+        let error = Disk::open(&path).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("written by magex {version}, which reads it; this is magex ")), "{error}");
+        assert!(error.ends_with("--data folder"), "{error}");
     }
-    let error = Disk::open(&path).unwrap_err().to_string();
-    assert!(error.starts_with("written by magex 0.1.0 (commit 389f705), which reads it; this is magex "), "{error}");
-    assert!(error.ends_with("--data folder"), "{error}");
 }

@@ -7,6 +7,7 @@ use crate::logging::set_live_line;
 use crate::planning_clock::PlanningClock;
 use indicatif::{ProgressBar, ProgressStyle};
 use magex_actor::rollout::Roller;
+use magex_assign::POWERS;
 use magex_core::config::{Algorithm, CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn};
@@ -149,7 +150,7 @@ impl Subject {
         if scheduler.learned() {
             return Err(usage(format!(
                 "RUN: {file} is a configuration, not weights, which the {scheduler} scheduler needs; \
-                 name a run folder, or add --scheduler exact, greedy or random"
+                 name a run folder, or add --scheduler exact, makespan, greedy or random"
             )));
         }
         if self.strict {
@@ -169,9 +170,13 @@ pub(crate) struct Variation {
     /// Team size; the map scales with it. Not for the mlp executor and the ranking scheduler, which have a fixed size.
     #[arg(long, value_name = "N", value_parser = options::whole::<usize>(1, AGENTS_MAX as u64))]
     pub(crate) agents: Option<usize>,
-    /// Goal scheduler: pairwise, ranking, exact, greedy or random.
+    /// Goal scheduler: pairwise, ranking, exact, makespan, greedy or random.
     #[arg(long, value_name = "KIND")]
     pub(crate) scheduler: Option<CommanderPolicy>,
+    /// Exponent of the distances that the exact and makespan schedulers sum; 2 lets the last agent arrive sooner [default: as in
+    /// the run].
+    #[arg(long, value_name = "P", value_parser = power)]
+    pub(crate) power: Option<f64>,
     /// What chooses the actions.
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub(crate) controller: Controller,
@@ -200,7 +205,7 @@ impl Variation {
         if let Some(kind) = self.scheduler.filter(|kind| kind.learned() && *kind != config.commander.kind) {
             let own = config.commander.kind;
             return Err(usage(format!(
-                "--scheduler {kind}: the run trained the {own} scheduler; use {own}, exact, greedy or random"
+                "--scheduler {kind}: the run trained the {own} scheduler; use {own}, exact, makespan, greedy or random"
             )));
         }
         config.task.spawn = self.spawn.unwrap_or(config.task.spawn);
@@ -209,7 +214,16 @@ impl Variation {
         if config.run.algorithm == Algorithm::Mappo {
             config.mappo.chunk_length = 1;
         }
-        let config = config.validated()?;
+        let mut config = config.validated()?;
+        if let Some(power) = self.power {
+            let scheduler = self.scheduler_of(&config);
+            if !scheduler.knows_power() && power != 1.0 {
+                return Err(usage(format!(
+                    "--power {power}: the {scheduler} scheduler has none; use --scheduler exact or makespan"
+                )));
+            }
+            config.commander.power = power;
+        }
         if let Some(classical) = self.controller.classical() {
             classical.check(&config.task).map_err(|error| usage(format!("--{error}")))?;
         }
@@ -245,6 +259,12 @@ pub(crate) struct Episodes {
     pub(crate) mode: Mode,
     /// Number of episodes to record, from the first.
     pub(crate) record: u32,
+}
+
+/// Parses an exponent of distances.
+fn power(text: &str) -> Result<f64, String> {
+    let number: Option<f64> = text.trim().parse().ok().filter(|number| POWERS.contains(number));
+    number.ok_or_else(|| format!("write a number from {} to {}", POWERS.start(), POWERS.end()))
 }
 
 /// Parses an evaluation set; the sets that training uses are rejected.
@@ -387,6 +407,12 @@ mod tests {
         let exact = Variation { scheduler: Some(CommanderPolicy::Exact), ..vary.clone() };
         exact.apply(&trained("[commander]\nkind = 'ranking'")).unwrap();
         let ranking = Variation { scheduler: Some(CommanderPolicy::Ranking), ..Variation::default() };
-        assert!(ranking.apply(&trained("")).unwrap_err().to_string().contains("use pairwise, exact, greedy or random"));
+        assert!(
+            ranking
+                .apply(&trained(""))
+                .unwrap_err()
+                .to_string()
+                .contains("use pairwise, exact, makespan, greedy or random")
+        );
     }
 }

@@ -62,7 +62,7 @@ pub fn commander(
         chosen.kind = kind;
     }
     match Commander::classical(chosen.kind) {
-        Some(classical) => Ok(classical),
+        Some(classical) => Ok(classical.with_power(chosen.power)),
         None => Commander::load(&chosen, config.task.agents, config.task.dims(), weights),
     }
 }

@@ -4,7 +4,8 @@
 //! |---|---|
 //! | `pairwise` | a score for every (agent, goal) pair; the agent of the largest regret picks next among the goals still free. Equivariant, any N |
 //! | `ranking` | the paper's Goal Scheduler: one score per goal, ranked, handed to the agents in canonical order |
-//! | `exact` | the least summed distance (Jonker–Volgenant; the paper's "Hungarian") |
+//! | `exact` | the least summed distance (Jonker–Volgenant; the paper's "Hungarian"), or sum of its powers |
+//! | `makespan` | the shortest longest distance; among those the least sum, or sum of powers |
 //! | `greedy` | the shortest remaining way of an agent to a goal, repeatedly |
 //! | `random` | a random permutation (the paper's ablation "w. RG") |
 
@@ -16,7 +17,7 @@ use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
 use candle_core::Tensor;
 use magex_assign::random::random;
-use magex_assign::{AssignError, distance, exact_points, greedy};
+use magex_assign::{AssignError, BottleneckSolver, Solver, distance, exact_points, greedy, powered};
 use magex_core::config::{CommanderConfig, CommanderPolicy};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
@@ -89,6 +90,8 @@ enum Net {
 /// A scheduler of any kind.
 pub struct Commander {
     kind: CommanderPolicy,
+    /// Exponent of the distances; 1 for schedulers that do not know it.
+    power: f64,
     net: Option<Net>,
 }
 
@@ -111,9 +114,11 @@ impl Commander {
             CommanderPolicy::Ranking => {
                 Some(Net::Ranking(RankingNet::build(config.hidden, agents, dims, config.order, params)?))
             }
-            CommanderPolicy::Exact | CommanderPolicy::Greedy | CommanderPolicy::Random => None,
+            CommanderPolicy::Exact | CommanderPolicy::Makespan | CommanderPolicy::Greedy | CommanderPolicy::Random => {
+                None
+            }
         };
-        Ok(Self { kind: config.kind, net })
+        Ok(Self { kind: config.kind, power: config.power, net })
     }
 
     /// Names, shapes and initial distributions of the parameters; none for schedulers that are not learned.
@@ -140,9 +145,14 @@ impl Commander {
         Self::of(config, agents, dims, &params)
     }
 
-    /// A scheduler without weights.
+    /// A scheduler without weights, of distances as they are.
     pub fn classical(kind: CommanderPolicy) -> Option<Self> {
-        (!kind.learned()).then_some(Self { kind, net: None })
+        (!kind.learned()).then_some(Self { kind, power: 1.0, net: None })
+    }
+
+    /// The same with an exponent of the distances.
+    pub fn with_power(self, power: f64) -> Self {
+        Self { power, ..self }
     }
 
     /// Which kind it is.
@@ -163,7 +173,12 @@ impl Commander {
             }
             (None, CommanderPolicy::Random) => Ok(classical(random(n, team.goal_count(), stream)?)),
             (None, CommanderPolicy::Greedy) => Ok(classical(greedy_goals(team)?)),
-            (None, _) => Ok(classical(exact_points(team.agents, team.goals, team.dims)?.0)),
+            (None, CommanderPolicy::Makespan) => Ok(classical(shortest_longest(team, self.power)?)),
+            (None, _) if self.power == 1.0 => Ok(classical(exact_points(team.agents, team.goals, team.dims)?.0)),
+            (None, _) => {
+                let costs = powers(team, self.power);
+                Ok(classical(Solver::default().solve(&costs, n, team.goal_count())?.col_of_row))
+            }
         }
     }
 
@@ -197,9 +212,19 @@ impl Commander {
     }
 }
 
+/// Distances `[N, G]`, raised to a power.
+fn powers(team: &Team<'_>, power: f64) -> Vec<f64> {
+    let (agents, goals) = (team.agents.chunks_exact(team.dims), team.goals.chunks_exact(team.dims));
+    agents.flat_map(|agent| goals.clone().map(|goal| powered(distance(agent, goal), power))).collect()
+}
+
 /// The goals that greedy assignment by distance gives.
 fn greedy_goals(team: &Team<'_>) -> Result<Vec<u32>, AssignError> {
-    let (agents, goals) = (team.agents.chunks_exact(team.dims), team.goals.chunks_exact(team.dims));
-    let cost: Vec<f64> = agents.flat_map(|agent| goals.clone().map(|goal| distance(agent, goal))).collect();
-    Ok(greedy(&cost, team.agent_count(), team.goal_count(), &|| true)?.col_of_row)
+    Ok(greedy(&powers(team, 1.0), team.agent_count(), team.goal_count(), &|| true)?.col_of_row)
+}
+
+/// The goals with the shortest longest distance; among those the least sum of powers.
+fn shortest_longest(team: &Team<'_>, power: f64) -> Result<Vec<u32>, AssignError> {
+    let costs = powers(team, power);
+    Ok(BottleneckSolver::default().solve_allowed(&costs, team.agent_count(), team.goal_count(), &|| true)?.col_of_row)
 }

@@ -15,7 +15,7 @@ use tokio::time::Instant;
 /// How often the files are looked at.
 const INTERVAL: Duration = Duration::from_secs(1);
 /// A certificate that ends within this time is warned of, once a day.
-const SOON: Duration = Duration::from_secs(14 * 86_400);
+const SOON: Duration = Duration::from_secs(30 * 86_400);
 const DAY: Duration = Duration::from_secs(86_400);
 
 type Reread = Box<dyn Fn() -> Result<(), Failure> + Send + Sync>;

@@ -44,6 +44,10 @@ pub struct ServiceArgs {
     pub health_check: bool,
 }
 
+/// Tasks that a network thread runs between two looks at its sockets. Tasks that receive long messages take a millisecond each; with
+/// tokio's 61 of them a short call waits for all.
+const EVENT_INTERVAL: u32 = 4;
+
 /// What a running service gets from [`main`].
 #[derive(Debug)]
 pub struct Context {
@@ -104,6 +108,7 @@ pub fn main<T>(
     let internal = |error| Failure::new(exit::INTERNAL, error);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(threads)
+        .event_interval(EVENT_INTERVAL)
         .thread_name("magex-net")
         .enable_all()
         .build()

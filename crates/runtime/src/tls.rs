@@ -18,7 +18,7 @@ use tokio_rustls::rustls::{ClientConfig, RootCertStore, ServerConfig};
 /// gRPC is HTTP/2.
 const ALPN: &[u8] = b"h2";
 
-/// The end of the validity of the certificate in a file, since 1970.
+/// The end of the validity of a certificate in a file, since 1970.
 pub(crate) type End = (PathBuf, Duration);
 
 /// A certificate chain and its key.
@@ -59,13 +59,14 @@ impl Pair {
     }
 }
 
-/// The certificates in a file, as those that are trusted.
-fn roots(file: &NamedFile) -> Result<RootCertStore, Failure> {
-    let mut roots = RootCertStore::empty();
-    for certificate in file.certificates()? {
+/// The certificates in a file, as those that are trusted, and their ends.
+fn roots(file: &NamedFile) -> Result<(RootCertStore, Vec<End>), Failure> {
+    let (mut roots, certificates) = (RootCertStore::empty(), file.certificates()?);
+    let ends = certificates.iter().filter_map(validity::end).map(|end| (file.path.clone(), end)).collect();
+    for certificate in certificates {
         roots.add(certificate).map_err(|error| file.wrong(format!("no certificate of an authority: {error}")))?;
     }
-    Ok(roots)
+    Ok((roots, ends))
 }
 
 /// A server's certificate and the CA of its clients.
@@ -86,11 +87,13 @@ impl ServerTls {
     }
 
     fn load(pair: &Pair, client_ca: Option<&NamedFile>) -> Result<(Arc<ServerConfig>, Vec<End>), Failure> {
-        let (chain, key, ends) = pair.read()?;
+        let (chain, key, mut ends) = pair.read()?;
         let builder = match client_ca {
             None => ServerConfig::builder().with_no_client_auth(),
             Some(file) => {
-                let verifier = WebPkiClientVerifier::builder(roots(file)?.into()).build();
+                let (roots, trusted) = roots(file)?;
+                ends.extend(trusted);
+                let verifier = WebPkiClientVerifier::builder(roots.into()).build();
                 ServerConfig::builder().with_client_cert_verifier(verifier.map_err(|error| file.wrong(error))?)
             }
         };
@@ -145,12 +148,14 @@ impl ClientTls {
     }
 
     fn load(ca: &NamedFile, pair: Option<&Pair>) -> Result<(Arc<ClientConfig>, Vec<End>), Failure> {
-        let builder = ClientConfig::builder().with_root_certificates(roots(ca)?);
-        let (mut config, ends) = match pair {
-            None => (builder.with_no_client_auth(), Vec::new()),
+        let (roots, mut ends) = roots(ca)?;
+        let builder = ClientConfig::builder().with_root_certificates(roots);
+        let mut config = match pair {
+            None => builder.with_no_client_auth(),
             Some(pair) => {
-                let (chain, key, ends) = pair.read()?;
-                (builder.with_client_auth_cert(chain, key).map_err(|error| pair.wrong(&error))?, ends)
+                let (chain, key, own) = pair.read()?;
+                ends.extend(own);
+                builder.with_client_auth_cert(chain, key).map_err(|error| pair.wrong(&error))?
             }
         };
         config.alpn_protocols.push(ALPN.into());

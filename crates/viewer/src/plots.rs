@@ -42,10 +42,28 @@ pub(crate) struct Series {
 /// Of the update: plot, title, unit, logarithmic or not, in curve.svg or not, and the series.
 type Update = (&'static str, &'static str, &'static str, bool, bool, &'static [(&'static str, &'static str, Kind)]);
 
-const UPDATES: [Update; 6] = [
+const UPDATES: [Update; 11] = [
     ("entropy", "Entropy", "nats per agent", false, true, &[("entropy", "executor/entropy", Kind::Actor)]),
     ("policy", "Policy loss", "", false, true, &[("policy_loss", "executor/policy_loss", Kind::Actor)]),
     ("value", "Value loss", "", true, true, &[("value_loss", "executor/value_loss", Kind::Critic)]),
+    ("td", "TD loss", "", true, true, &[("td_loss", "executor/td_loss", Kind::Critic)]),
+    (
+        "q_tot",
+        "Q_tot",
+        "mean of the joint actions taken",
+        false,
+        true,
+        &[("q_tot_mean", "executor/q_tot_mean", Kind::Critic)],
+    ),
+    ("epsilon", "ε", "share of random actions", false, true, &[("epsilon", "executor/epsilon", Kind::Actor)]),
+    (
+        "intrinsic",
+        "Intrinsic reward",
+        "per agent and step",
+        false,
+        true,
+        &[("intrinsic_reward", "executor/intrinsic_reward", Kind::Critic)],
+    ),
     (
         "gradient",
         "Gradient norm",
@@ -55,6 +73,17 @@ const UPDATES: [Update; 6] = [
         &[
             ("actor_grad_norm", "executor/actor_grad_norm", Kind::Actor),
             ("critic_grad_norm", "executor/critic_grad_norm", Kind::Critic),
+        ],
+    ),
+    (
+        "q_gradient",
+        "Gradient norm",
+        "before clipping",
+        true,
+        false,
+        &[
+            ("agent_grad_norm", "executor/agent_grad_norm", Kind::Actor),
+            ("mixer_grad_norm", "executor/mixer_grad_norm", Kind::Critic),
         ],
     ),
     (

@@ -35,7 +35,8 @@ async fn main() -> anyhow::Result<()> {
     });
 
     // Three robots, three charging stations, and a robot that must not use the first one.
-    let points = |coordinates: &[f32]| Some(Positions { dims: 2, coordinates: coordinates.to_vec(), array: None });
+    let points =
+        |coordinates: &[f64]| Some(Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() });
     let names = |names: [&str; 3]| names.map(str::to_owned).to_vec();
     let request = AssignRequest {
         agents: points(&[0.0, 0.0, 4.0, 0.0, 8.0, 0.0]),
@@ -57,7 +58,8 @@ async fn main() -> anyhow::Result<()> {
     println!("total {:.3}, answered by {:?} in {:.3} ms", answer.cost, answer.scheduler(), 1e3 * answer.seconds);
 
     // A mission: the service remembers the team, and moves a robot to another goal only if that is worth 2 metres.
-    let member = |id: &str, position: [f32; 2]| Member { id: id.to_owned(), position: position.to_vec(), state: 0 };
+    let member =
+        |id: &str, position: [f64; 2]| Member { id: id.to_owned(), position: position.to_vec(), ..Default::default() };
     let mission = CreateMissionRequest {
         title: "evening charge".to_owned(),
         agents: vec![member("ada", [0.0, 0.0]), member("bob", [4.0, 0.0])],
@@ -69,7 +71,7 @@ async fn main() -> anyhow::Result<()> {
     let mission_id = first.mission_id.clone();
     let watch = WatchAssignmentsRequest { mission_ids: vec![mission_id.clone()], ..Default::default() };
     let mut changes = client.watch_assignments(watch).await?.into_inner();
-    let failed = Member { id: "ada".to_owned(), position: vec![], state: MemberState::Failed.into() };
+    let failed = Member { id: "ada".to_owned(), state: MemberState::Failed.into(), ..Default::default() };
     let update = UpdateMissionRequest { mission_id: mission_id.clone(), agents: vec![failed], ..Default::default() };
     client.update_mission(update).await?;
     while let Some(event) = changes.message().await? {

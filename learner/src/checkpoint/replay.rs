@@ -17,7 +17,7 @@ fn folder(run: &Path) -> PathBuf {
 
 /// Writes the blocks that have no file yet. A file has its name only when it is complete and safe from a power cut, and its name
 /// says what is in it.
-pub(super) fn write(disk: &mut dyn Disk, run: &Path, replay: &Replay) -> Result<(), CheckpointError> {
+pub(super) fn write(disk: &dyn Disk, run: &Path, replay: &Replay) -> Result<(), CheckpointError> {
     let folder = folder(run);
     disk.create_dir(&folder).map_err(in_file(&folder))?;
     for block in replay.blocks() {
@@ -48,13 +48,13 @@ pub(super) fn read(
 }
 
 /// Removes the files of some iterations, and half-written ones.
-pub(super) fn remove(run: &Path, which: impl Fn(u32) -> bool) {
+pub(super) fn remove(disk: &dyn Disk, run: &Path, which: impl Fn(u32) -> bool) {
     for entry in fs::read_dir(folder(run)).into_iter().flatten().filter_map(Result::ok) {
         let name = entry.file_name();
         let name = name.to_string_lossy();
         let iteration = name.split('-').next().and_then(|digits| digits.parse().ok());
         let goes = iteration.is_some_and(&which) || name.starts_with('.');
-        if goes && let Err(error) = fs::remove_file(entry.path()) {
+        if goes && let Err(error) = disk.remove_file(&entry.path()) {
             // It only takes room.
             tracing::warn!(%error, path = %entry.path().display(), "old episodes cannot be removed");
         }

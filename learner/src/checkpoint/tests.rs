@@ -204,9 +204,9 @@ fn what_a_kill_left_half_written_is_removed_and_nothing_else() {
         fs::create_dir(checkpoints.join(name)).unwrap();
     }
     fs::write(checkpoints.join(".000013.tmp/weights.safetensors"), "half").unwrap();
-    clean(run.path(), 9);
+    clean(&FileSystem, run.path(), 9);
     let left = |name: &str| checkpoints.join(name).exists();
     assert!(!left(".000013.tmp"));
     assert!(left("000012") && left(".000009.old") && left(".notes.tmp") && left("mine"));
-    clean(&run.path().join("nowhere"), 9);
+    clean(&FileSystem, &run.path().join("nowhere"), 9);
 }

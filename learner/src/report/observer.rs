@@ -62,7 +62,7 @@ pub trait RunObserver: Debug + Send {
     ///
     /// # Errors
     /// A file cannot be cut back.
-    fn went_back(&mut self, _folder: &Path, _iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
+    fn went_back(&mut self, _iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
         Ok(())
     }
 
@@ -75,8 +75,13 @@ pub trait RunObserver: Debug + Send {
     /// Something happened: an iteration, a message, a checkpoint, or the end of the run.
     fn event(&mut self, _event: &RunEvent) {}
 
-    /// Makes what was written so far durable, before a checkpoint that contains it. Errors show again in [`Self::flush`].
-    fn sync(&mut self) {}
+    /// Makes what was written so far durable, before a checkpoint that contains it.
+    ///
+    /// # Errors
+    /// A file cannot be made durable.
+    fn sync(&mut self) -> Result<(), FileError> {
+        Ok(())
+    }
 
     /// Writes what an earlier error left unwritten, before the summary.
     ///

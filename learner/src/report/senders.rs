@@ -90,7 +90,7 @@ impl RunObserver for SendersFile {
         }
     }
 
-    fn went_back(&mut self, _folder: &Path, iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
+    fn went_back(&mut self, iteration: u32, _joint_env_steps: u64) -> Result<(), FileError> {
         self.cut(iteration).map_err(|error| FileError { path: self.path.clone(), error })
     }
 }
@@ -115,7 +115,7 @@ mod tests {
         let first = "{\"iteration\":0,\"shards\":[{\"index\":0,\"actor\":\"a\",\"process\":\"ab\",\"sha256\":\"d0\"},\
                      {\"index\":1,\"actor\":\"a\",\"process\":\"ac\",\"sha256\":\"d1\"}]}";
         assert_eq!((read().lines().count(), read().lines().next()), (3, Some(first)));
-        file.went_back(folder.path(), 2, 0).unwrap();
+        file.went_back(2, 0).unwrap();
         assert_eq!(read().lines().count(), 2);
         // Half a line, as a kill leaves it.
         file.append("{\"iteration\":2,\"sh").unwrap();

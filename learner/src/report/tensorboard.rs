@@ -1,16 +1,18 @@
 //! The numbers of metrics.jsonl in TensorBoard's format: `tensorboard/events.out.tfevents.NNNN` in the run folder.
 //!
-//! Each process of a run writes its own file. The file of a resumed run begins with the step from which it counts: TensorBoard
+//! Each process of a run writes its own file, and another one after a failed write. The file of a resumed run begins with the step from which it counts: TensorBoard
 //! then drops later steps of earlier files, as metrics.jsonl drops those lines. Files are numbered, not named by the clock,
 //! because TensorBoard reads them in the order of their names.
 //!
 //! A record is framed as TensorFlow does: length, masked CRC-32C of the length, bytes, masked CRC-32C of the bytes.
 
+use crate::checkpoint::disk::{Disk as _, FileSystem, Place, identity};
 use crate::report::observer::{FileError, RunObserver};
 use crate::report::records::IterationMetrics;
 use magex_proto::v1::IterationEvent;
 use prost::Message;
 use serde_json::Value;
+use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -58,43 +60,87 @@ struct SessionLog {
     status: i32,
 }
 
-/// Writes event files. An error is logged once and ends the writing; training continues.
+/// Limit of the records kept while they cannot be written; the oldest are dropped first.
+const MAX_WAITING: usize = 4096;
+
+/// Writes event files. Records that cannot be written wait, and begin a new file when they can: the end of the old one may be half
+/// a record.
 #[derive(Debug)]
-pub(crate) enum EventFile {
-    /// Nothing is written after an error.
-    Off,
-    /// No file yet: the folder, and the steps that a resumed run continues from.
-    Waiting(PathBuf, Option<u64>),
-    Open(File, PathBuf),
+pub(crate) struct EventFile {
+    place: Place,
+    /// The steps that a resumed run continues from.
+    resumed: Option<u64>,
+    /// This process has begun a file.
+    begun: bool,
+    open: Option<OpenFile>,
+    /// Records with their steps.
+    waiting: VecDeque<(u64, Vec<u8>)>,
+}
+
+#[derive(Debug)]
+struct OpenFile {
+    file: File,
+    path: PathBuf,
+    identity: Option<(u64, u64)>,
 }
 
 impl EventFile {
     /// In a run folder; `resumed` is the number of steps that the run continues from. The file appears with the first line.
-    pub(crate) fn new(folder: &Path, resumed: Option<u64>) -> Self {
-        Self::Waiting(folder.join(FOLDER), resumed)
+    pub(crate) fn new(place: Place, resumed: Option<u64>) -> Self {
+        Self { place, resumed, begun: false, open: None, waiting: VecDeque::new() }
     }
 
     /// Writes a line of metrics.jsonl: every number in it becomes a scalar at `step`.
     fn append(&mut self, line: &str, step: u64) {
-        if let Err((path, error)) = self.write(line, step) {
-            tracing::warn!(path = %path.display(), %error, "no more TensorBoard events will be written");
-            *self = Self::Off;
-        }
-    }
-
-    fn write(&mut self, line: &str, step: u64) -> Result<(), (PathBuf, Error)> {
-        if let Self::Waiting(folder, resumed) = self {
-            let (file, path) = open(folder, *resumed).map_err(|error| (folder.clone(), error))?;
-            *self = Self::Open(file, path);
-        }
-        let Self::Open(file, path) = self else { return Ok(()) };
+        let failed_before = !self.waiting.is_empty();
         let mut values = Vec::new();
         if let Ok(line) = serde_json::from_str(line) {
             scalars("", &line, &mut values);
         }
         let record = record(step, Event { summary: Some(Summary { values }), ..Event::default() });
-        // One write, so that a concurrent reader finds whole records.
-        file.write_all(&record).map_err(|error| (path.clone(), error))
+        self.waiting.push_back((step, record));
+        if self.waiting.len() > MAX_WAITING {
+            self.waiting.pop_front();
+        }
+        match self.write_waiting() {
+            Ok(()) if failed_before => tracing::info!("TensorBoard events can be written again"),
+            Ok(()) => {}
+            Err(error) => {
+                self.open = None;
+                match failed_before {
+                    true => tracing::debug!(%error, "TensorBoard events still cannot be written"),
+                    false => tracing::warn!(%error, "TensorBoard events cannot be written; they wait until they can"),
+                }
+            }
+        }
+    }
+
+    fn write_waiting(&mut self) -> Result<(), FileError> {
+        let folder = self.place.folder().join(FOLDER);
+        let at = |path: &Path| {
+            let path = path.to_owned();
+            move |error| FileError { path, error }
+        };
+        self.place.check().map_err(at(&folder))?;
+        // One that another program removed takes no more records.
+        let own = self.open.take().filter(|open| identity(&open.path) == open.identity);
+        let Some((step, _)) = self.waiting.front() else { return Ok(()) };
+        let mut open = match own {
+            Some(open) => open,
+            None => {
+                // The end of the file before may be half a record of this step.
+                let from = if self.begun { Some(*step) } else { self.resumed };
+                begin(&folder, from).map_err(at(&folder))?
+            }
+        };
+        self.begun = true;
+        while let Some((_, record)) = self.waiting.front() {
+            // One write, so that a concurrent reader finds whole records.
+            open.file.write_all(record).map_err(at(&open.path))?;
+            self.waiting.pop_front();
+        }
+        self.open = Some(open);
+        Ok(())
     }
 }
 
@@ -104,15 +150,16 @@ impl RunObserver for EventFile {
     }
 
     /// Another file, as after a resume.
-    fn went_back(&mut self, folder: &Path, _iteration: u32, joint_env_steps: u64) -> Result<(), FileError> {
-        *self = Self::new(folder, Some(joint_env_steps));
+    fn went_back(&mut self, _iteration: u32, joint_env_steps: u64) -> Result<(), FileError> {
+        self.waiting.retain(|(step, _)| *step < joint_env_steps);
+        (self.resumed, self.begun, self.open) = (Some(joint_env_steps), false, None);
         Ok(())
     }
 }
 
 /// Creates the next file, with the records that every file begins with.
-fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
-    std::fs::create_dir_all(folder)?;
+fn begin(folder: &Path, resumed: Option<u64>) -> Result<OpenFile, Error> {
+    FileSystem.create_dir(folder)?;
     let number = |name: &str| name.strip_prefix(PREFIX)?.parse::<u32>().ok();
     let names = std::fs::read_dir(folder)?.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
     let mut next = names.filter_map(|name| number(&name)).max().unwrap_or(0);
@@ -128,8 +175,12 @@ fn open(folder: &Path, resumed: Option<u64>) -> Result<(File, PathBuf), Error> {
     if let Some(steps) = resumed {
         head.extend(record(steps, Event { session_log: Some(SessionLog { status: 1 }), ..Event::default() }));
     }
-    file.write_all(&head)?;
-    Ok((file, path))
+    if let Err(error) = file.write_all(&head) {
+        // A full disk would collect one with every iteration.
+        let _ = std::fs::remove_file(&path);
+        return Err(error);
+    }
+    Ok(OpenFile { identity: identity(&path), file, path })
 }
 
 /// The numbers of an object: those at the top level under `run/`, the others under the name of their object.

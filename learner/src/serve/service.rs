@@ -108,6 +108,7 @@ impl LearnerHandle {
             in_flight: InFlight::new(IN_FLIGHT, CancellationToken::new()),
             streams: STREAMS,
             message_bytes: MAX_MESSAGE_BYTES,
+            too_long: None,
             calls: None,
         };
         let router = server::builder()

@@ -82,7 +82,7 @@ pub enum TrainError {
     NoParent(String),
     /// The run folder was removed or replaced while the run went on.
     #[error(
-        "{}: the run folder was removed or replaced while the run went on; what was trained since its last checkpoint is lost",
+        "{}: the run folder was removed, moved or replaced while the run went on, and is not back; what was trained since its last checkpoint is lost",
         .0.display()
     )]
     Gone(PathBuf),
@@ -129,6 +129,14 @@ impl TrainError {
     /// Whether a file of the run folder cannot be written, or the folder is gone.
     pub fn is_output(&self) -> bool {
         matches!(self, Self::File(_) | Self::Gone(_) | Self::Checkpoint(CheckpointError::File { .. }))
+    }
+
+    /// What the system says, if a file of the run folder cannot be used.
+    pub fn io(&self) -> Option<&std::io::Error> {
+        match self {
+            Self::File(error) => Some(&error.error),
+            _ => None,
+        }
     }
 }
 

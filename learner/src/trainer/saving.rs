@@ -1,7 +1,7 @@
 //! Checkpoints and the last files of a run, and what happens when they cannot be written.
 
 use super::{TrainError, Trainer};
-use crate::checkpoint::disk::{FileSystem, replace_file};
+use crate::checkpoint::disk::replace_file;
 use crate::checkpoint::{self, Progress};
 use crate::collector::Collector;
 use crate::report::observer::FileError;
@@ -53,9 +53,9 @@ impl Trainer {
     ) -> Result<Option<StopReason>, TrainError> {
         let (start, mut backoff, mut reported) = (Instant::now(), Backoff::default(), false);
         loop {
-            self.is_there()?;
             let Err(error) = self.write_files(files) else { return Ok(None) };
             if start.elapsed() >= LAST_FILES_PATIENCE {
+                self.is_there().map_err(|_| TrainError::Gone(self.place.folder().to_owned()))?;
                 return Err(TrainError::LastFiles(error, LAST_FILES_PATIENCE.as_secs()));
             }
             if !reported {
@@ -76,10 +76,11 @@ impl Trainer {
     }
 
     fn write_files(&mut self, files: &[(&str, &[u8])]) -> Result<(), FileError> {
+        self.is_there()?;
         self.observers.iter_mut().try_for_each(|observer| observer.flush())?;
         for (name, bytes) in files {
-            replace_file(&mut FileSystem, &self.folder, name, bytes)
-                .map_err(|error| FileError { path: self.folder.join(name), error })?;
+            replace_file(&*self.disk, self.place.folder(), name, bytes)
+                .map_err(|error| FileError { path: self.place.folder().join(name), error })?;
         }
         Ok(())
     }
@@ -88,9 +89,14 @@ impl Trainer {
         self.is_there()?;
         // A checkpoint has the lines of its iterations, also after a power cut: a resume does not write them again.
         self.observers.iter_mut().try_for_each(|observer| observer.flush())?;
-        self.notify(|observer| observer.sync());
+        self.observers.iter_mut().try_for_each(|observer| observer.sync())?;
         let progress = Progress { wall_s: self.wall_s(), ..self.progress.clone() };
-        let keep = (self.config.run.keep_checkpoints, self.unconfirmed_since);
-        Ok(checkpoint::write_keeping(&mut FileSystem, &self.folder, &progress, &self.learned, keep)?)
+        let (folder, keep) = (self.place.folder(), (self.config.run.keep_checkpoints, self.unconfirmed_since));
+        Ok(checkpoint::write_keeping(&*self.disk, folder, &progress, &self.learned, keep)?)
+    }
+
+    /// A checkpoint in a folder that was removed would make one without the other files of a run.
+    fn is_there(&self) -> Result<(), FileError> {
+        self.place.check().map_err(|error| FileError { path: self.place.folder().to_owned(), error })
     }
 }

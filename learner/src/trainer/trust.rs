@@ -71,8 +71,8 @@ impl Trainer {
             return Ok(());
         };
         let from = self.progress.iteration;
-        let Some((progress, learned)) = checkpoint::go_back(&self.folder, since, &self.learned) else {
-            checkpoint::set_aside(&self.folder);
+        let Some((progress, learned)) = checkpoint::go_back(self.place.folder(), since, &self.learned) else {
+            checkpoint::set_aside(self.place.folder());
             return Err(TrainError::Tainted { what, iteration: since });
         };
         let (to, steps) = (progress.iteration, progress.joint_env_steps);
@@ -95,8 +95,7 @@ impl Trainer {
     }
 
     fn cut_back(&mut self, iteration: u32, joint_env_steps: u64) -> Result<(), FileError> {
-        let folder = self.folder.clone();
-        self.observers.iter_mut().try_for_each(|observer| observer.went_back(&folder, iteration, joint_env_steps))
+        self.observers.iter_mut().try_for_each(|observer| observer.went_back(iteration, joint_env_steps))
     }
 
     /// Updates, or finds the results that made the update fail: these are kept aside and their actors evicted, and the update
@@ -158,7 +157,7 @@ impl Trainer {
             reason,
             "a result cannot be trained on; it is kept in quarantine, its actor is evicted, and the shard is computed again"
         );
-        let folder = self.folder.join(QUARANTINE);
+        let folder = self.place.folder().join(QUARANTINE);
         let name = format!(
             "{:06}-{:04}-{}",
             result.shard.iteration.0,

@@ -25,21 +25,26 @@ pub fn assign(bytes: &[u8]) {
         Err(error) => panic!("a problem that was read was refused: {error}"),
     };
     let response = answer::write(&problem, &plan);
-    check_matching(&response, problem.agent_count, problem.goal_count);
+    check_matching(&response, problem.agent_count, &problem.terms.capacities, problem.goal_count);
     let banned = response.pairs.iter().find(|pair| problem.forbidden.contains(&(pair.agent_index, pair.goal_index)));
     assert!(banned.is_none(), "{banned:?} is forbidden");
 }
 
-/// Every agent and every goal is in one pair or left over, and every number is one.
-pub fn check_matching(response: &AssignResponse, agents: usize, goals: usize) {
-    let (mut agent_free, mut goal_free) = (vec![true; agents], vec![true; goals]);
+/// Every agent is in one pair or left over, every goal has as many agents as it takes or fewer, and every number is one.
+pub fn check_matching(response: &AssignResponse, agents: usize, capacities: &[u32], goals: usize) {
+    let mut agent_free = vec![true; agents];
+    let mut places: Vec<u32> = (0..goals).map(|goal| capacities.get(goal).copied().unwrap_or(1)).collect();
+    let mut served = vec![false; goals];
     for pair in &response.pairs {
+        let goal = pair.goal_index as usize;
         assert!(std::mem::take(&mut agent_free[pair.agent_index as usize]), "an agent has two goals");
-        assert!(std::mem::take(&mut goal_free[pair.goal_index as usize]), "a goal has two agents");
-        assert!(pair.cost.is_finite() && pair.distance.is_finite());
+        assert!(places[goal] > 0, "a goal has more agents than it takes");
+        (places[goal], served[goal]) = (places[goal] - 1, true);
+        assert!(pair.cost.is_finite() && pair.distance.is_finite() && pair.arrival.is_none_or(f64::is_finite));
     }
     assert_eq!(response.pairs.len() + response.agents_without_goal.len(), agents);
-    assert_eq!(response.pairs.len() + response.goals_without_agent.len(), goals);
+    let served = served.into_iter().filter(|served| *served).count();
+    assert_eq!(served + response.goals_without_agent.len(), goals);
     assert!(response.cost.is_finite() && response.gap.is_none_or(f64::is_finite));
 }
 

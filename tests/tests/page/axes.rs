@@ -39,6 +39,7 @@ async fn awkward() -> (Arc<LivePage>, SocketAddr) {
         last_seen_ms: 9_500,
         threads: 4,
         weights_version: Some(3),
+        ..Default::default()
     };
     let status = v1::RunStatus { state: v1::RunState::Collecting.into(), actors: vec![actor], ..Default::default() };
     let listening = http::bind("127.0.0.1:0").await.unwrap();

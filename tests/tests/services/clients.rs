@@ -15,21 +15,22 @@ use tonic_health::pb::health_client::HealthClient;
 use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus};
 use tonic_types::StatusExt as _;
 
-pub(crate) fn positions(coordinates: &[f32]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
+pub(crate) fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
+    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
-/// Two agents; the goal of each is nearest to the other's place in the list.
+/// Two agents, for a model; the goal of each is nearest to the other's place in the list.
 pub(crate) fn team() -> v1::AssignRequest {
     v1::AssignRequest {
         agents: positions(&[0.0, 0.0, 3.0, 4.0]),
         goals: positions(&[3.0, 4.0, 0.0, 0.5]),
+        scheduler: v1::AssignmentMethod::Learned.into(),
         ..Default::default()
     }
 }
 
 fn grid(n: usize) -> Option<v1::Positions> {
-    positions(&(0..2 * n).map(|k| ((k * 7919) % 1009) as f32).collect::<Vec<_>>())
+    positions(&(0..2 * n).map(|k| ((k * 7919) % 1009) as f64).collect::<Vec<_>>())
 }
 
 fn pair(agent_index: u32, goal_index: u32) -> v1::PairRef {
@@ -70,7 +71,9 @@ async fn every_scheduler_and_every_kind_of_cost_over_the_wire() {
     let reply = client.assign(v1::AssignRequest { switching_cost: 4.0, ..sticky }).await.unwrap().into_inner();
     assert_eq!((goals(&reply), reply.switches), (vec![1, 0], 2));
     let matrix = v1::CostMatrix { agents: 1, goals: 3, values: vec![3.0, 1.0, 2.0] };
-    let reply = client.assign(v1::AssignRequest { costs: Some(matrix), ..Default::default() }).await.unwrap();
+    let scheduler = v1::AssignmentMethod::Learned.into();
+    let reply =
+        client.assign(v1::AssignRequest { costs: Some(matrix), scheduler, ..Default::default() }).await.unwrap();
     let reply = reply.into_inner();
     assert_eq!((goals(&reply), reply.cost, reply.unassigned_goals.clone()), (vec![1], 1.0, vec![0, 2]));
     assert_eq!(reply.goals_without_agent[0].reason(), v1::UnassignedReason::Outnumbered);
@@ -82,7 +85,7 @@ async fn every_scheduler_and_every_kind_of_cost_over_the_wire() {
 async fn many_teams_and_streams_of_teams() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;
-    let wrong = v1::AssignRequest { goals: positions(&[1.0, f32::NAN]), ..team() };
+    let wrong = v1::AssignRequest { goals: positions(&[1.0, f64::NAN]), ..team() };
     let teams = vec![team(), wrong.clone()];
     let status = client.assign_many(v1::AssignManyRequest { teams }).await.unwrap_err();
     assert_eq!(field(&status), "teams[1].goals.coordinates[1]");
@@ -205,6 +208,7 @@ async fn a_model_that_is_slow_or_broken_is_stood_in_for() {
     let asked = |n, seconds| v1::AssignRequest {
         agents: grid(n),
         goals: grid(n),
+        scheduler: v1::AssignmentMethod::Learned.into(),
         deadline_seconds: Some(seconds),
         ..Default::default()
     };

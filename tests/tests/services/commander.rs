@@ -21,8 +21,8 @@ async fn health(client: &mut HealthClient<Channel>) -> ServingStatus {
     client.check(HealthCheckRequest { service: String::new() }).await.unwrap().into_inner().status()
 }
 
-fn positions(coordinates: &[f32]) -> Option<v1::Positions> {
-    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), array: None })
+fn positions(coordinates: &[f64]) -> Option<v1::Positions> {
+    Some(v1::Positions { dims: 2, coordinates: coordinates.to_vec(), ..Default::default() })
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -99,6 +99,7 @@ async fn outside_clients_get_assignments_with_and_without_a_model() {
         agents: positions(&[0.0, 0.0, 3.0, 4.0]),
         goals: positions(&[3.0, 4.0, 0.0, 0.5]),
         agent_ids: vec!["a".into(), "b".into()],
+        scheduler: v1::AssignmentMethod::Learned.into(),
         ..Default::default()
     };
     let reply = client.assign(request.clone()).await.unwrap().into_inner();
@@ -127,7 +128,7 @@ async fn outside_clients_get_assignments_with_and_without_a_model() {
     let reply = client.assign(more).await.unwrap().into_inner();
     assert_eq!((reply.scheduler(), reply.unassigned_agents.as_slice()), (v1::AssignmentMethod::Exact, &[0][..]));
     assert!(reply.fallback_reason.contains("as many goals as agents"));
-    let bad = v1::AssignRequest { goals: positions(&[3.0, f32::NAN]), ..request };
+    let bad = v1::AssignRequest { goals: positions(&[3.0, f64::NAN]), ..request };
     let status = client.assign(bad).await.unwrap_err();
     assert_eq!(status.get_details_bad_request().unwrap().field_violations[0].field, "goals.coordinates[1]");
     commander.stop().await;

@@ -15,8 +15,8 @@ use tonic_types::StatusExt as _;
 
 type Client = CommanderServiceClient<Channel>;
 
-fn member(id: &str, position: [f32; 2]) -> v1::Member {
-    v1::Member { id: id.into(), position: position.to_vec(), state: 0 }
+fn member(id: &str, position: [f64; 2]) -> v1::Member {
+    v1::Member { id: id.into(), position: position.to_vec(), ..Default::default() }
 }
 
 /// Two robots and two tasks, each pair a unit apart.
@@ -92,7 +92,7 @@ async fn a_mission_is_created_watched_updated_and_deleted() {
     assert!((crossed.saving.unwrap() - 12.0).abs() < 1e-5, "{:?}", crossed.saving);
     // Another mission is none of this watcher's business.
     update(&mut client, moved(&drawn, vec![])).await;
-    let failed = v1::Member { id: "r2".into(), position: vec![], state: v1::MemberState::Failed.into() };
+    let failed = v1::Member { id: "r2".into(), state: v1::MemberState::Failed.into(), ..Default::default() };
     let left = update(&mut client, moved("site", vec![failed])).await;
     assert_eq!(left.goals_without_agent[0].id, "t1");
     for revision in 2..=4 {
@@ -147,7 +147,7 @@ async fn a_page_is_cut_before_it_is_too_long_to_take() {
     let commander = Commander::start("127.0.0.1:0", None).await;
     let mut client = commander_client(&commander.url).await;
     let long = "x".repeat(60);
-    let agents: Vec<_> = (0..1000).map(|k| member(&format!("{long}{k}"), [k as f32, 0.0])).collect();
+    let agents: Vec<_> = (0..1000).map(|k| member(&format!("{long}{k}"), [f64::from(k), 0.0])).collect();
     let mut expected = Vec::new();
     for k in 0..60 {
         let id = format!("m{k:02}");
@@ -180,7 +180,7 @@ async fn updates_at_the_same_time_lose_nothing() {
         .map(|k| {
             let mut client = client.clone();
             tokio::spawn(async move {
-                update(&mut client, moved("busy", vec![member(&format!("n{k}"), [1.0, k as f32])])).await
+                update(&mut client, moved("busy", vec![member(&format!("n{k}"), [1.0, f64::from(k)])])).await
             })
         })
         .collect();

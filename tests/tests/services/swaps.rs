@@ -34,10 +34,17 @@ fn load_numbered(bytes: &[u8], _: &str) -> Result<Arc<dyn Scheduler>, SchedulerE
 }
 
 fn octet() -> v1::AssignRequest {
-    let points: Vec<f32> = (0..16).map(|k| k as f32).collect();
+    let points: Vec<f64> = (0..16).map(f64::from).collect();
     // So much time that a stall of this machine does not bring in the exact scheduler.
     let deadline_seconds = Some(30.0);
-    v1::AssignRequest { agents: positions(&points), goals: positions(&points), deadline_seconds, ..Default::default() }
+    let scheduler = v1::AssignmentMethod::Learned.into();
+    v1::AssignRequest {
+        agents: positions(&points),
+        goals: positions(&points),
+        scheduler,
+        deadline_seconds,
+        ..Default::default()
+    }
 }
 
 /// The one version that an answer shows in everything it says.

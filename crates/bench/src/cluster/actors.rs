@@ -109,9 +109,13 @@ async fn send(url: String, process_id: u64, results: Arc<Vec<Bytes>>, accepted: 
             }
             Some(Response::Ack(ack)) => {
                 match ack.verdict() {
-                    v1::Verdict::Accepted => accepted.fetch_add(1, Ordering::Relaxed),
+                    v1::Verdict::Accepted => {
+                        accepted.fetch_add(1, Ordering::Relaxed);
+                    }
+                    // A second computation, or the slower one of a hedged lease.
+                    v1::Verdict::Duplicate => {}
                     other => bail!("{other:?}: {}", ack.reason),
-                };
+                }
                 sender.send(message(Request::Ready(v1::Ready { credit: 1 }))).await?;
             }
             Some(Response::Welcome(_)) => {}

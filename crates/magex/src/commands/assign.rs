@@ -4,6 +4,7 @@ use crate::failure::{unavailable, usage};
 use crate::options::CommonOptions;
 use crate::output::{Table, note};
 use anyhow::Context as _;
+use magex_assign::POWERS;
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
 use magex_proto::v1;
@@ -27,8 +28,12 @@ Examples:
   magex assign --connect http://10.0.0.2:7100 --random 50 --seed 7
 
 A team file is {\"agents\": [[x, y], …], \"goals\": [[x, y], …]} with two or \
-    three coordinates. With more agents than goals some agents get no goal, and \
-    vice versa. gap: excess of the summed distance over the minimum.
+    three coordinates, and what else there is to say: costs (a matrix in place of \
+    the distances; null forbids a pair), agent_speeds, agent_offsets, agent_loads, \
+    balance, goal_weights, goal_capacities, goal_earliest, goal_due, precedence \
+    ([[goal, after], …]), pinned, forbidden and current ([[agent, goal], …]), \
+    switching_cost, power. With more agents than goals some agents get no goal, and \
+    vice versa. gap: excess of the summed cost over the minimum.
 
 Exit codes: 0 success, 1 the commander rejected the request or failed, 64 wrong \
     usage or positions, 69 the commander cannot be reached";
@@ -55,6 +60,9 @@ pub(crate) struct AssignArgs {
     /// Assignment method.
     #[arg(long, value_enum, value_name = "KIND", default_value = "exact")]
     pub(crate) scheduler: Kind,
+    /// Exponent of the costs: 2 lets the last agent arrive sooner [default: as in the team file, or 1].
+    #[arg(long, value_name = "P", value_parser = power)]
+    pub(crate) power: Option<f64>,
     /// How the goals are chosen.
     #[arg(long, value_enum, value_name = "MODE", default_value = "greedy")]
     pub(crate) mode: Choice,
@@ -68,13 +76,13 @@ pub(crate) struct AssignArgs {
 pub(crate) enum Kind {
     /// The trained commander.
     Learned = v1::AssignmentMethod::Learned as isize,
-    /// Minimal summed distance.
+    /// Minimal summed cost.
     Exact = v1::AssignmentMethod::Exact as isize,
     /// The nearest free pair, repeatedly.
     Greedy = v1::AssignmentMethod::Greedy as isize,
     /// A random matching.
     Random = v1::AssignmentMethod::Random as isize,
-    /// Minimal longest distance.
+    /// Minimal largest cost.
     Makespan = v1::AssignmentMethod::Makespan as isize,
 }
 
@@ -87,21 +95,14 @@ pub(crate) enum Choice {
     Sampled = v1::Mode::Sampled as isize,
 }
 
-#[derive(Debug, Clone, PartialEq)]
-struct Team {
-    agents: Vec<Vec<f32>>,
-    goals: Vec<Vec<f32>>,
-}
-
 pub(crate) fn run(args: &AssignArgs, options: &CommonOptions) -> anyhow::Result<u8> {
     let team = team(args)?;
     let request = v1::AssignRequest {
-        agents: Some(positions("agents", &team.agents)?),
-        goals: Some(positions("goals", &team.goals)?),
         scheduler: args.scheduler as i32,
         mode: args.mode as i32,
         seed: args.seed,
-        ..Default::default()
+        power: args.power.or(team.power),
+        ..team
     };
     let settings = args.security.read().map_err(usage)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
@@ -137,20 +138,39 @@ async fn rejected(commander: &Remote, status: &Status) -> anyhow::Error {
 
 fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignResponse, round_trip: f64) {
     let output = options.output();
-    let mut table = Table::new(0, &["agent", "goal", "distance", "probability"]);
+    // Costs that are not distances have a column of their own.
+    let priced = response.pairs.iter().any(|pair| pair.cost != pair.distance);
+    let timed = response.last_arrival.is_some();
+    let columns = [
+        ("agent", true),
+        ("goal", true),
+        ("distance", true),
+        ("cost", priced),
+        ("arrival", timed),
+        ("probability", true),
+    ];
+    let heading: Vec<&str> = columns.into_iter().filter(|(_, shown)| *shown).map(|(name, _)| name).collect();
+    let mut table = Table::new(0, &heading);
     for pair in &response.pairs {
         let name = |name: &str, index: u32| if name.is_empty() { index.to_string() } else { name.to_owned() };
-        table.row(vec![
+        let cells = [
             name(&pair.agent_id, pair.agent_index),
             name(&pair.goal_id, pair.goal_index),
             format!("{:.4}", pair.distance),
+            format!("{:.4}", pair.cost),
+            format!("{:.4}", pair.arrival.unwrap_or(0.0)),
             pair.probability.map_or_else(|| "-".into(), |p| format!("{p:.4}")),
-        ]);
+        ];
+        table.row(cells.into_iter().zip(columns).filter(|(_, (_, shown))| *shown).map(|(cell, _)| cell).collect());
     }
     output.say(table.to_string());
-    for (what, left) in [("agents", &response.unassigned_agents), ("goals", &response.unassigned_goals)] {
+    for (what, left) in [("agents", &response.agents_without_goal), ("goals", &response.goals_without_agent)] {
         if !left.is_empty() {
-            let list: Vec<String> = left.iter().map(u32::to_string).collect();
+            let told = |member: &v1::Unassigned| match member.reason() {
+                v1::UnassignedReason::Outnumbered => member.index.to_string(),
+                other => format!("{} ({})", member.index, reason(other)),
+            };
+            let list: Vec<String> = left.iter().map(told).collect();
             output.say(format!("  unassigned {what}: {}", list.join(", ")));
         }
     }
@@ -164,11 +184,13 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
         _ => format!(" (version {}, weights {weights})", response.version),
     };
     output.say(format!(
-        "\n  summed distance {:.4}, minimum {}, gap {}, longest {:.4}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        "\n  summed {} {:.4}, minimum {}, gap {}, largest {:.4}{}\n  answered by {answered}{version} in {:.2} ms ({:.1} ms with the network)",
+        if priced { "cost" } else { "distance" },
         response.cost,
         response.exact_cost.map_or_else(|| "not computed".into(), |cost| format!("{cost:.4}")),
         response.gap.map_or_else(|| "unknown".into(), |gap| format!("{:.2} %", 100.0 * gap)),
         response.largest_cost,
+        if priced { format!(", distance {:.4}", response.distance) } else { String::new() },
         1e3 * response.seconds,
         1e3 * round_trip
     ));
@@ -177,13 +199,24 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
         note(format!("note: {answered} answered instead of {:?}: {reason}", args.scheduler).to_lowercase());
     }
     let pairs = response.pairs.iter().map(|p| {
-        json!({ "agent": p.agent_index, "goal": p.goal_index, "distance": p.distance, "probability": p.probability })
+        json!({
+            "agent": p.agent_index, "goal": p.goal_index, "distance": p.distance, "cost": p.cost, "arrival": p.arrival,
+            "probability": p.probability,
+        })
     });
+    let left = |members: &[v1::Unassigned]| -> Vec<Value> {
+        members.iter().map(|m| json!({ "index": m.index, "reason": reason(m.reason()) })).collect()
+    };
     output.result(&json!({
         "pairs": pairs.collect::<Vec<_>>(),
         "unassigned_agents": response.unassigned_agents,
         "unassigned_goals": response.unassigned_goals,
+        "agents_without_goal": left(&response.agents_without_goal),
+        "goals_without_agent": left(&response.goals_without_agent),
         "cost": response.cost,
+        "distance": response.distance,
+        "last_arrival": response.last_arrival,
+        "unserved_cost": response.unserved_cost,
         "exact_cost": response.exact_cost,
         "gap": response.gap,
         "largest_cost": response.largest_cost,
@@ -197,29 +230,111 @@ fn show(args: &AssignArgs, options: &CommonOptions, response: &v1::AssignRespons
     }));
 }
 
-fn team(args: &AssignArgs) -> anyhow::Result<Team> {
+/// Why a member is left over, in words.
+fn reason(reason: v1::UnassignedReason) -> &'static str {
+    match reason {
+        v1::UnassignedReason::Unspecified => "unknown",
+        v1::UnassignedReason::Outnumbered => "outnumbered",
+        v1::UnassignedReason::Forbidden => "forbidden",
+        v1::UnassignedReason::Conflict => "partners taken",
+        v1::UnassignedReason::Inactive => "inactive",
+        v1::UnassignedReason::TooLate => "too late",
+        v1::UnassignedReason::NotOpen => "not open",
+    }
+}
+
+/// The team of the arguments, as far as it is given.
+fn team(args: &AssignArgs) -> anyhow::Result<v1::AssignRequest> {
+    let of_points = |agents: &[Vec<f64>], goals: &[Vec<f64>]| {
+        let (agents, goals) = (Some(positions("agents", agents)?), Some(positions("goals", goals)?));
+        Ok(v1::AssignRequest { agents, goals, ..Default::default() })
+    };
     if let Some(n) = args.random {
         let side = (2.0 * f64::from(n)).sqrt();
         let mut stream = Key::new(args.seed.unwrap_or(0), Purpose::Request, &[n]).stream();
-        let mut point = |_| (0..2).map(|_| stream.range(-side / 2.0, side / 2.0) as f32).collect::<Vec<f32>>();
-        return Ok(Team { agents: (0..n).map(&mut point).collect(), goals: (0..n).map(&mut point).collect() });
+        let mut point = |_| (0..2).map(|_| stream.range(-side / 2.0, side / 2.0)).collect::<Vec<f64>>();
+        let agents: Vec<_> = (0..n).map(&mut point).collect();
+        return of_points(&agents, &(0..n).map(&mut point).collect::<Vec<_>>());
     }
     let agents = read("agents", args.agents.as_deref().unwrap_or_default())?;
     let agents = parse("agents", &agents)?;
     if let Some(goals) = &args.goals {
         let goals = parse("goals", &read("goals", goals)?)?;
-        return Ok(Team { agents: points("--agents", &agents)?, goals: points("--goals", &goals)? });
+        return of_points(&points("--agents", &agents)?, &points("--goals", &goals)?);
     }
     let form = "give {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}, or add --goals";
     let Value::Object(team) = agents else { return Err(usage(format!("--agents: there are no goals; {form}"))) };
-    if let Some(key) = team.keys().find(|key| !["agents", "goals"].contains(&key.as_str())) {
-        return Err(usage(format!("--agents: unknown key '{key}'; {form}")));
+    if !team.contains_key("costs") {
+        for key in ["agents", "goals"] {
+            let missing = || usage(format!("--agents: '{key}' is missing; {form}"));
+            team.get(key).map(drop).ok_or_else(missing)?;
+        }
     }
-    let side = |key: &str| {
-        let list = team.get(key).ok_or_else(|| usage(format!("--agents: '{key}' is missing; {form}")))?;
-        points(&format!("--agents: {key}"), list)
-    };
-    Ok(Team { agents: side("agents")?, goals: side("goals")? })
+    let mut request = v1::AssignRequest::default();
+    for (key, value) in &team {
+        let field = format!("--agents: {key}");
+        match key.as_str() {
+            "agents" => request.agents = Some(positions(key, &points(&field, value)?)?),
+            "goals" => request.goals = Some(positions(key, &points(&field, value)?)?),
+            "costs" => request.costs = Some(matrix(&field, value)?),
+            "agent_speeds" => request.agent_speeds = of_json(&field, value)?,
+            "agent_offsets" => request.agent_offsets = of_json(&field, value)?,
+            "agent_loads" => request.agent_loads = of_json(&field, value)?,
+            "balance" => request.balance = of_json(&field, value)?,
+            "goal_weights" => request.goal_weights = of_json(&field, value)?,
+            "goal_capacities" => request.goal_capacities = of_json(&field, value)?,
+            "goal_earliest" => request.goal_earliest = of_json(&field, value)?,
+            "goal_due" => {
+                let due: Vec<Option<f64>> = of_json(&field, value)?;
+                request.goal_due = due.into_iter().map(|due| due.unwrap_or(f64::INFINITY)).collect();
+            }
+            "precedence" => {
+                let order: Vec<[u32; 2]> = of_json(&field, value)?;
+                let after = |[goal_index, after_index]: [u32; 2]| v1::Precedence {
+                    goal_index,
+                    after_index,
+                    ..Default::default()
+                };
+                request.precedence = order.into_iter().map(after).collect();
+            }
+            "pinned" => request.pinned = pairs(&field, value)?,
+            "forbidden" => request.forbidden = pairs(&field, value)?,
+            "current" => request.current = pairs(&field, value)?,
+            "switching_cost" => request.switching_cost = of_json(&field, value)?,
+            "power" => request.power = Some(of_json(&field, value)?),
+            _ => return Err(usage(format!("--agents: unknown key '{key}'; `magex assign --help` lists them"))),
+        }
+    }
+    Ok(request)
+}
+
+/// Parses an exponent of costs.
+fn power(text: &str) -> Result<f64, String> {
+    let number: Option<f64> = text.trim().parse().ok().filter(|number| POWERS.contains(number));
+    number.ok_or_else(|| format!("write a number from {} to {}", POWERS.start(), POWERS.end()))
+}
+
+fn of_json<T: serde::de::DeserializeOwned>(field: &str, value: &Value) -> anyhow::Result<T> {
+    serde_json::from_value(value.clone()).map_err(|error| usage(format!("{field}: {error}")))
+}
+
+fn pairs(field: &str, value: &Value) -> anyhow::Result<Vec<v1::PairRef>> {
+    let list: Vec<[u32; 2]> = of_json(field, value)?;
+    let pair = |[agent_index, goal_index]: [u32; 2]| v1::PairRef { agent_index, goal_index, ..Default::default() };
+    Ok(list.into_iter().map(pair).collect())
+}
+
+/// Costs, one row per agent; null forbids a pair.
+fn matrix(field: &str, value: &Value) -> anyhow::Result<v1::CostMatrix> {
+    let rows: Vec<Vec<Option<f64>>> = of_json(field, value)?;
+    let goals = rows.first().map_or(0, Vec::len);
+    if let Some(place) = rows.iter().position(|row| row.len() != goals) {
+        let wrong = rows[place].len();
+        return Err(usage(format!("{field}[{place}]: {wrong} costs, the first row has {goals}")));
+    }
+    let agents = rows.len() as u32;
+    let values = rows.into_iter().flatten().map(|cost| cost.unwrap_or(f64::INFINITY)).collect();
+    Ok(v1::CostMatrix { agents, goals: goals as u32, values })
 }
 
 fn parse(field: &str, text: &str) -> anyhow::Result<Value> {
@@ -230,14 +345,14 @@ fn parse(field: &str, text: &str) -> anyhow::Result<Value> {
 }
 
 /// The points of a list; an error names the one that is wrong.
-fn points(field: &str, list: &Value) -> anyhow::Result<Vec<Vec<f32>>> {
+fn points(field: &str, list: &Value) -> anyhow::Result<Vec<Vec<f64>>> {
     let wrong = |place: String, what: &str, value: &Value| usage(format!("{field}{place}: {value} is not {what}"));
     let list = list.as_array().ok_or_else(|| wrong(String::new(), "a list of points; give [[x, y], …]", list))?;
     let point = |(i, point): (usize, &Value)| {
         let numbers = point.as_array().ok_or_else(|| wrong(format!("[{i}]"), "a point; give [x, y]", point))?;
         let number = |(k, value): (usize, &Value)| {
-            let number = value.as_f64().map(|number| number as f32).filter(|number| number.is_finite());
-            number.ok_or_else(|| wrong(format!("[{i}][{k}]"), "a number up to 3.4e38", value))
+            let number = value.as_f64().filter(|number| number.is_finite());
+            number.ok_or_else(|| wrong(format!("[{i}][{k}]"), "a number", value))
         };
         numbers.iter().enumerate().map(number).collect()
     };
@@ -258,7 +373,7 @@ fn read(field: &str, text: &str) -> anyhow::Result<String> {
     }
 }
 
-fn positions(field: &str, points: &[Vec<f32>]) -> anyhow::Result<v1::Positions> {
+fn positions(field: &str, points: &[Vec<f64>]) -> anyhow::Result<v1::Positions> {
     // An empty side is answered, too: the members of the other one are left over.
     let dims = points.first().map_or(2, Vec::len);
     if !(2..=3).contains(&dims) {
@@ -268,7 +383,7 @@ fn positions(field: &str, points: &[Vec<f32>]) -> anyhow::Result<v1::Positions> 
         let wrong = points[place].len();
         return Err(usage(format!("{field}[{place}]: {wrong} coordinates, the first point has {dims}")));
     }
-    Ok(v1::Positions { dims: dims as u32, coordinates: points.concat(), array: None })
+    Ok(v1::Positions { dims: dims as u32, coordinates: points.concat(), ..Default::default() })
 }
 
 #[cfg(test)]

@@ -18,10 +18,10 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 use tokio::time::Sleep;
-use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::{Bytes, Service, http};
 use tonic::server::NamedService;
+use tonic::{Code, Status};
 use truncate_status::truncate_status;
 
 /// Timeout of a message of a stream, from its first byte to its last, and of the whole request of a unary call.
@@ -42,8 +42,10 @@ pub struct Rules {
     pub in_flight: Arc<InFlight>,
     /// Streaming methods.
     pub streams: &'static [&'static str],
-    /// Longest message, bytes; the service itself rejects longer ones.
+    /// Longest message, bytes.
     pub message_bytes: usize,
+    /// What a caller can do about a longer one; without it the service itself rejects longer ones.
+    pub too_long: Option<&'static str>,
     /// Where calls are counted, if anywhere.
     pub calls: Option<Calls>,
 }
@@ -87,7 +89,7 @@ impl<S> Guard<S> {
                 let kind = kind(request.uri(), rules.streams);
                 let permit = rules.in_flight.acquire(&caller, kind)?;
                 request.extensions_mut().insert(caller);
-                (permit, kind, Limit { bytes: rules.message_bytes, strict: false })
+                (permit, kind, Limit { bytes: rules.message_bytes, remedy: rules.too_long })
             }
             Policy::Public => {
                 if let Some(address) = address {
@@ -97,7 +99,7 @@ impl<S> Guard<S> {
                 let caller = Caller { name: name.into(), role: Role::Client };
                 let kind = kind(request.uri(), ANONYMOUS_STREAMS);
                 let permit = self.connections.anonymous().acquire(&caller, kind)?;
-                (permit, kind, Limit { bytes: ANONYMOUS_MESSAGE, strict: true })
+                (permit, kind, Limit { bytes: ANONYMOUS_MESSAGE, remedy: Some("send a shorter one") })
             }
         };
         if let Some(deadline) = Deadline::of(request.headers()) {
@@ -180,8 +182,16 @@ fn kind(uri: &http::Uri, streams: &[&str]) -> CallKind {
 #[derive(Debug, Clone, Copy)]
 struct Limit {
     bytes: usize,
-    /// Longer messages are rejected here. Otherwise the service rejects them itself, without buffering them.
-    strict: bool,
+    /// With it, longer messages are rejected here. Otherwise the service rejects them itself, without buffering them.
+    remedy: Option<&'static str>,
+}
+
+impl Limit {
+    /// The status of a message that is too long, with what its sender can do about it.
+    fn too_long(&self, what: &str) -> Status {
+        let remedy = self.remedy.map(|remedy| format!("; {remedy}")).unwrap_or_default();
+        Status::out_of_range(format!("{what} exceeds the limit of {} bytes{remedy}", self.bytes))
+    }
 }
 
 /// A request's body whose messages are counted while they arrive.
@@ -222,7 +232,11 @@ impl Metered {
                 (arrived, data) = data.split_at(step);
                 self.rest -= step;
                 if let Some(inflating) = &mut self.inflating {
-                    self.permit.reserve(inflating.push(arrived)?)?;
+                    let length = inflating.push(arrived).map_err(|status| match status.code() {
+                        Code::OutOfRange => self.limit.too_long("what comes out of the compressed message"),
+                        _ => status,
+                    })?;
+                    self.permit.reserve(length)?;
                 } else if let Some(plain) = &mut plain {
                     plain.extend_from_slice(arrived);
                 }
@@ -244,11 +258,8 @@ impl Metered {
                     }
                     if self.rest <= self.limit.bytes {
                         self.permit.reserve(self.rest)?;
-                    } else if self.limit.strict || self.inflating.is_some() {
-                        let (length, limit) = (self.rest, self.limit.bytes);
-                        return Err(Status::out_of_range(format!(
-                            "message of {length} bytes exceeds the limit of {limit}"
-                        )));
+                    } else if self.limit.remedy.is_some() || self.inflating.is_some() {
+                        return Err(self.limit.too_long(&format!("a message of {} bytes", self.rest)));
                     }
                     if self.rest == 0 {
                         self.timeout = None;

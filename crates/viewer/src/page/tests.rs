@@ -31,6 +31,7 @@ fn status() -> v1::RunStatus {
         last_seen_ms: 12,
         threads: 4,
         weights_version: Some(3),
+        ..Default::default()
     };
     let ledger = v1::LedgerStatus { leased: 10, trained: 6, outstanding: 2, ..Default::default() };
     v1::RunStatus {

@@ -115,7 +115,7 @@ const LINE: &str = r#"{"iteration":3,"joint_env_steps":480,"success_rate":null,"
 #[test]
 fn every_number_of_a_line_is_read_back() {
     let folder = tempfile::tempdir().unwrap();
-    let mut file = EventFile::new(folder.path(), None);
+    let mut file = EventFile::new(Place::of(folder.path()), None);
     assert!(!folder.path().join(FOLDER).exists(), "nothing before the first line");
     file.append(LINE, 480);
     file.append(r#"{"reward":1e300,"iteration":4}"#, 640);
@@ -139,11 +139,11 @@ fn every_number_of_a_line_is_read_back() {
 #[test]
 fn a_resumed_run_begins_a_file_that_takes_back_what_it_does_again() {
     let folder = tempfile::tempdir().unwrap();
-    let mut first = EventFile::new(folder.path(), None);
+    let mut first = EventFile::new(Place::of(folder.path()), None);
     (0..=2).for_each(|k| first.append(LINE, 160 * k));
     // A trainer that ends before its first line leaves nothing.
-    drop(EventFile::new(folder.path(), Some(320)));
-    let mut second = EventFile::new(folder.path(), Some(320));
+    drop(EventFile::new(Place::of(folder.path()), Some(320)));
+    let mut second = EventFile::new(Place::of(folder.path()), Some(320));
     second.append(LINE, 320);
     let events = read(&folder.path().join("tensorboard/events.out.tfevents.0002"));
     assert!(events[1].started && events[1].step == 320, "{:?}", events[1]);
@@ -152,11 +152,35 @@ fn a_resumed_run_begins_a_file_that_takes_back_what_it_does_again() {
 }
 
 #[test]
-fn a_folder_that_cannot_be_written_only_ends_the_writing() {
+fn events_that_cannot_be_written_wait_and_begin_a_new_file() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join(FOLDER), "a file in the way").unwrap();
-    let mut file = EventFile::new(folder.path(), None);
+    let events = folder.path().join(FOLDER);
+    std::fs::write(&events, "a file in the way").unwrap();
+    let mut file = EventFile::new(Place::of(folder.path()), None);
+    (1..=2).for_each(|k| file.append(LINE, 160 * k));
+    std::fs::remove_file(&events).unwrap();
+    file.append(LINE, 480);
+    let steps = |number: u32| {
+        let read = read(&events.join(format!("{PREFIX}{number:04}")));
+        read.iter().map(|event| event.step).collect::<Vec<_>>()
+    };
+    assert_eq!(steps(1), [0, 160, 320, 480]);
+    // Another program removes the file: the next one takes back what may be left of its first step.
+    std::fs::remove_file(events.join(format!("{PREFIX}0001"))).unwrap();
+    file.append(LINE, 640);
+    assert_eq!(steps(1), [0, 640, 640]);
+    // A folder in the place of the run gets nothing.
+    let (run, away) = (folder.path().join("run"), folder.path().join("away"));
+    std::fs::create_dir(&run).unwrap();
+    let mut file = EventFile::new(Place::of(&run), None);
     file.append(LINE, 160);
-    assert!(matches!(file, EventFile::Off));
+    std::fs::rename(&run, &away).unwrap();
+    std::fs::create_dir(&run).unwrap();
     file.append(LINE, 320);
+    assert_eq!(std::fs::read_dir(&run).unwrap().count(), 0);
+    std::fs::remove_dir(&run).unwrap();
+    std::fs::rename(&away, &run).unwrap();
+    file.append(LINE, 480);
+    let second = read(&run.join(FOLDER).join(format!("{PREFIX}0002")));
+    assert_eq!(second.iter().map(|event| event.step).collect::<Vec<_>>(), [0, 320, 320, 480]);
 }

@@ -59,3 +59,82 @@ fn the_gradient_of_the_value_loss_is_its_slope_and_the_loss_is_linear_beyond_del
     let loss = clipped_value_loss(&vector(&[0.4]), &vector(&[0.4]), &vector(&[30.4]), 0.2, 10.0).unwrap();
     assert!((loss.to_vec1::<f32>().unwrap()[0] - 250.0).abs() < 1e-3);
 }
+
+/// Samples from the logits and keeps what it chose, with its log-probability.
+struct Sampler {
+    stream: magex_core::rng::Stream,
+    actions: Vec<u8>,
+    log_probs: Vec<f32>,
+}
+
+impl magex_nets::executor::Chooser for Sampler {
+    fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8] {
+        let weights: Vec<f64> = logits.iter().map(|&logit| libm::exp(logit.into())).collect();
+        let mut left = self.stream.range(0.0, weights.iter().sum());
+        let action = weights.iter().position(|weight| {
+            left -= weight;
+            left < 0.0
+        });
+        let action = action.unwrap_or(weights.len() - 1);
+        self.actions[row] = action as u8;
+        self.log_probs[row] = libm::log(weights[action] / weights.iter().sum::<f64>()) as f32;
+        &self.actions[row..=row]
+    }
+}
+
+/// The share of copies after training. The first agent is paid nothing and its entropy keeps it random; the second one is paid
+/// for doing the same. Nothing that it sees tells what the first one does.
+fn copies(kind: magex_core::config::ExecutorKind) -> f64 {
+    use magex_core::task::{RewardTarget, Spawn, TaskConfig};
+    let (episodes, rounds) = (256, 40);
+    let mut config = RunConfig {
+        task: TaskConfig {
+            horizon: 1,
+            reward_target: RewardTarget::Team,
+            ..TaskConfig::simple_spread(2, Spawn::Uniform)
+        },
+        ..RunConfig::default()
+    };
+    config.executor.kind = kind;
+    config.executor.hidden = 16;
+    (config.mappo.minibatch_size, config.mappo.entropy_coef, config.mappo.chunk_length) = (128, 0.05, 1);
+    (config.mappo.actor_learning_rate, config.mappo.critic_learning_rate) = (3e-3, 3e-3);
+    (config.collect.episodes_per_iteration, config.collect.shards_per_iteration) = (episodes, 1);
+    let mappo = Mappo::new(&config.validated().unwrap()).unwrap();
+    let mut learned = Learned { networks: mappo.init().unwrap(), value_norm: mappo.value_norm(), replay: None };
+    let mut share = 0.0;
+    for iteration in 0..rounds {
+        let shard = crate::fixtures::train_shard(iteration, 0, episodes);
+        let mut t = crate::fixtures::trajectory(&mappo.config.task, shard);
+        // A joint state in which everything is where the origin is, again and again.
+        let s = t.shape;
+        t.positions = vec![0.0; (s.steps + 1) * s.episodes * s.bodies * s.dims];
+        t.velocities.clone_from(&t.positions);
+        t.actions = vec![0; s.steps * s.episodes * s.agents];
+        t.statics =
+            magex_core::statics::Statics::landmarks(s.landmarks, s.dims, vec![0.0; s.episodes * s.landmarks * s.dims]);
+        let seen = Batch::new(1, mappo.spec(), std::slice::from_ref(&t));
+        let units: Vec<(usize, usize)> = (0..s.episodes).map(|episode| (episode, 0)).collect();
+        let slice = Slice { batch: &seen, units: &units, chunk: 1, samples: 1.0 };
+        let constants = |network: &Network| ParamBuilder::with(network.params.tensors().unwrap());
+        let policy = mappo.model.policy(&mut learned.networks.iter().map(constants).collect::<Vec<_>>()).unwrap();
+        let rows = s.episodes * s.agents;
+        let stream = Key::new(5, Purpose::Bench, &[iteration]).stream();
+        let mut sampler = Sampler { stream, actions: vec![0; rows], log_probs: vec![0.0; rows] };
+        policy.act(&slice.input(&slice.features(), Vec::new(), GraphNoise::Off), &mut sampler).unwrap();
+        (t.actions, t.log_probs) = (sampler.actions, sampler.log_probs);
+        t.rewards = t.actions.chunks_exact(2).flat_map(|pair| [0.0, f32::from(u8::from(pair[0] == pair[1]))]).collect();
+        share = f64::from(t.rewards.iter().sum::<f32>()) / s.episodes as f64;
+        let batch = Batch::new(1, mappo.spec(), &[t]);
+        mappo.update(&mut learned, &batch, iteration, 0.0).unwrap();
+    }
+    share
+}
+
+#[test]
+fn only_an_agent_that_is_told_what_the_one_before_it_does_can_copy_it() {
+    use magex_core::config::ExecutorKind::{Mat, MatDec};
+    let (mat, mat_dec) = (copies(Mat), copies(MatDec));
+    assert!(mat > 0.9, "MAT copies {mat}");
+    assert!(mat_dec < 0.4, "MAT-Dec copies {mat_dec}, chance is 0.2");
+}

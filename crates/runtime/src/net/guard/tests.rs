@@ -22,7 +22,16 @@ fn metered(kind: CallKind, strict: bool) -> (mpsc::UnboundedSender<Bytes>, Meter
     let in_flight = InFlight::new(limits, CancellationToken::new());
     let permit = in_flight.acquire(&Caller { name: "a".into(), role: Role::Client }, kind).unwrap();
     let (chunks, receiver) = mpsc::unbounded_channel();
-    (chunks, Metered::new(Body::new(Chunks(receiver)), Arc::new(permit), kind, Limit { bytes: 100, strict }, None))
+    (
+        chunks,
+        Metered::new(
+            Body::new(Chunks(receiver)),
+            Arc::new(permit),
+            kind,
+            Limit { bytes: 100, remedy: strict.then_some("shorter") },
+            None,
+        ),
+    )
 }
 
 async fn next(body: &mut Metered) -> Option<Result<Frame<Bytes>, Status>> {

@@ -1,0 +1,101 @@
+//! Nearly the final prices: rows bid for their cheapest column, and who is outbid bids again.
+
+use super::NONE;
+use super::candidates::{Candidates, Engine};
+use crate::AssignError;
+
+/// Bids per row and stage, at most: what is left then is the shortest paths' work.
+const BIDS: usize = 8;
+/// ε falls by this from stage to stage.
+const FALL: f64 = 0.2;
+const STAGES: usize = 7;
+
+impl<C: Candidates> Engine<C> {
+    /// Gives most rows a column that is one of their cheapest. With as many rows as columns, stages of falling ε; otherwise a
+    /// column must keep the price 0 until it is taken, and once taken it never becomes free again: one stage without ε.
+    pub(super) fn auction(&mut self, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+        let rows = self.col_of_row.len();
+        let mut free: Vec<u32> = (0..rows as u32).collect();
+        if rows == self.row_of_col.len() && rows > 1 {
+            let mut epsilon = self.first_epsilon();
+            for _ in 0..STAGES {
+                self.bid(&mut free, epsilon, BIDS * rows, should_continue)?;
+                epsilon *= FALL;
+                self.free_unless_best(&mut free, epsilon);
+            }
+            self.free_unless_best(&mut free, 0.0);
+        }
+        self.bid(&mut free, 0.0, 4 * rows, should_continue)
+    }
+
+    /// The mean difference between the cheapest and the second cheapest column.
+    fn first_epsilon(&mut self) -> f64 {
+        let rows = self.col_of_row.len();
+        let mut sum = 0.0;
+        for row in 0..rows as u32 {
+            let best = self.best(row);
+            // A row may have only one column.
+            sum += if best.second < f64::INFINITY { best.second - best.least } else { 0.0 };
+        }
+        4.0 * sum / rows as f64
+    }
+
+    /// Frees the rows whose column is not within ε of their cheapest.
+    fn free_unless_best(&mut self, free: &mut Vec<u32>, epsilon: f64) {
+        for row in 0..self.col_of_row.len() as u32 {
+            let col = self.col_of_row[row as usize];
+            if col != NONE && self.own(row) > self.best(row).least + epsilon {
+                self.col_of_row[row as usize] = NONE;
+                self.row_of_col[col as usize] = NONE;
+                free.push(row);
+            }
+        }
+    }
+
+    /// Every free row takes its cheapest column at a price that makes the second cheapest one better by ε, and the row that had
+    /// it is next. Rows that are left are `free` afterwards.
+    fn bid(
+        &mut self,
+        free: &mut Vec<u32>,
+        epsilon: f64,
+        mut budget: usize,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError> {
+        let mut left = Vec::new();
+        for first in std::mem::take(free) {
+            if !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
+            let mut row = first;
+            loop {
+                let best = self.best(row);
+                if best.col as usize >= self.cols() {
+                    (self.col_of_row[row as usize], self.row_of_col[best.col as usize]) = (best.col, row);
+                    break;
+                }
+                let price = self.price[best.col as usize];
+                // A row that has only one column may keep it at any price.
+                let margin = if best.second < f64::INFINITY { best.second - best.least } else { 0.0 };
+                let lowered = price - margin - epsilon;
+                let progress = lowered < price;
+                if progress {
+                    self.set_price(best.col, lowered);
+                }
+                let displaced = std::mem::replace(&mut self.row_of_col[best.col as usize], row);
+                self.col_of_row[row as usize] = best.col;
+                if displaced == NONE {
+                    break;
+                }
+                self.col_of_row[displaced as usize] = NONE;
+                budget = budget.saturating_sub(1);
+                if !progress || budget == 0 {
+                    left.push(displaced);
+                    break;
+                }
+                row = displaced;
+            }
+        }
+        *free = left;
+        Ok(())
+    }
+}

@@ -1,0 +1,320 @@
+//! Assignment of agents to goals by distance, without a cost matrix.
+
+use super::candidates::Candidates;
+use super::costs::{Metric, OwnCost, OwnCosts};
+use super::tree::{Found, Tree};
+use super::{Order, solve};
+use crate::points::{check_points, check_power};
+use crate::ties::Exact;
+use crate::{AssignError, Assignment, LARGEST_COST, Solver, Span, Switching, UNASSIGNED, compensated_sum, costs_into};
+
+/// Members of the longer side from which on the matrix is left out: below, reading it is faster.
+pub(super) const WORTH_IT: usize = 1000;
+
+/// Agents and goals; a pair costs distance^power, unless it has a cost of its own.
+#[derive(Debug, Clone, Copy)]
+pub struct PointProblem<'a, T> {
+    /// `[rows, dims]`
+    pub agents: &'a [T],
+    /// `[cols, dims]`
+    pub goals: &'a [T],
+    /// Coordinates of a point.
+    pub dims: usize,
+    /// Exponent of the distance, 1 to 16.
+    pub power: f64,
+    /// (row, column, cost) of pairs that cost something else; +∞ forbids a pair. The last one of a pair counts.
+    pub costs: &'a [(u32, u32, f64)],
+    /// Pairs in force.
+    pub switching: Switching<'a>,
+}
+
+impl<'a, T> PointProblem<'a, T> {
+    /// Distances, to the power of 1.
+    pub fn new(agents: &'a [T], goals: &'a [T], dims: usize) -> Self {
+        Self { agents, goals, dims, power: 1.0, costs: &[], switching: Switching::default() }
+    }
+}
+
+/// As many pairs as possible, then the smallest summed cost + switching cost × switches, then the fewest switches, then the
+/// lowest matching, as [`Solver::solve_switching`] of the matrix of costs, in memory that grows with the points only.
+/// Positions have 1 to 3 coordinates; more are solved by the matrix. Stops as soon as `should_continue` returns false.
+///
+/// Where more than about 64 pairs per agent are equally good (points on one line), the answer is as cheap as doubles can tell
+/// (10^-12 of the sum of the largest costs) and deterministic, but not always the lowest one.
+pub fn solve_points<T: Copy + Into<f64>>(
+    problem: &PointProblem<'_, T>,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
+    let (rows, cols) = check(problem)?;
+    if rows.max(cols) < WORTH_IT || problem.dims > 3 {
+        let cost = matrix(problem)?;
+        return Solver::default().solve_switching(&cost, rows, cols, &problem.switching, should_continue);
+    }
+    solve_sparse(problem, rows, cols, Limit::NONE, should_continue)
+}
+
+/// Largest cost of a pair.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limit {
+    pub(super) cost: f64,
+    /// Whether it leaves a matching of the whole shorter side.
+    pub(super) complete: bool,
+}
+
+impl Limit {
+    pub(super) const NONE: Self = Self { cost: f64::INFINITY, complete: false };
+}
+
+/// The matrix of all costs.
+pub(super) fn matrix<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<Vec<f64>, AssignError> {
+    let mut cost = Vec::new();
+    let (_, cols) = costs_into(problem.agents, problem.goals, problem.dims, problem.power, &mut cost)?;
+    for &(row, col, own) in problem.costs {
+        cost[row as usize * cols + col as usize] = own;
+    }
+    Ok(cost)
+}
+
+/// Checks a problem; returns (rows, columns).
+pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<(usize, usize), AssignError> {
+    check_power(problem.power)?;
+    let (rows, cols) = check_points(problem.agents, problem.goals, problem.dims)?;
+    problem.switching.check(rows, cols)?;
+    for (k, &(row, col, cost)) in problem.costs.iter().enumerate() {
+        if row as usize >= rows || col as usize >= cols {
+            let text = format!("pair ({row}, {col}) is not within {rows} agents and {cols} goals");
+            return Err(AssignError::invalid(format!("costs[{k}]"), text));
+        }
+        if cost.is_nan() || cost < -LARGEST_COST || (cost > LARGEST_COST && cost < f64::INFINITY) {
+            let text = format!("{cost} is neither a number up to 1e300 nor +inf, which forbids the pair");
+            return Err(AssignError::invalid(format!("costs[{k}]"), text));
+        }
+    }
+    Ok((rows, cols))
+}
+
+/// Without the matrix; pairs that cost more than the limit are forbidden.
+pub(super) fn solve_sparse<T: Copy + Into<f64>>(
+    problem: &PointProblem<'_, T>,
+    rows: usize,
+    cols: usize,
+    limit: Limit,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
+    match problem.dims {
+        1 => solve_dims::<T, 1>(problem, rows, cols, limit, should_continue),
+        2 => solve_dims::<T, 2>(problem, rows, cols, limit, should_continue),
+        _ => solve_dims::<T, 3>(problem, rows, cols, limit, should_continue),
+    }
+}
+
+fn solve_dims<T: Copy + Into<f64>, const D: usize>(
+    problem: &PointProblem<'_, T>,
+    rows: usize,
+    cols: usize,
+    limit: Limit,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
+    let turned = rows > cols;
+    let metric = Metric { power: problem.power, limit: limit.cost };
+    let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
+    let own = own_costs(problem, &agents, &goals, metric);
+    let sink = sink(&own, &agents, &goals, metric)?.filter(|_| !limit.complete);
+    let (short, long) = if turned { (&goals, &agents) } else { (&agents, &goals) };
+    // Neighbours in space become neighbours in memory.
+    let (tree, col_at) = Tree::new(long);
+    let (_, row_at) = Tree::new(short);
+    let mut place_of_col = vec![0; long.len()];
+    (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
+    let source = Points {
+        from: row_at.iter().map(|&row| short[row as usize]).collect(),
+        own: own.places(&row_at, &place_of_col),
+        tree,
+        metric,
+        sink,
+    };
+    let exact = PointCosts { from: short, to: long, metric, own: &own, sink: sink.unwrap_or(0.0), turned };
+    let order = Order { row_at, col_at };
+    let col_of_row = solve(source, &order, &exact, should_continue)?;
+    let mut goal_of = vec![UNASSIGNED; rows];
+    for (row, &col) in (0u32..).zip(&col_of_row).filter(|(_, col)| (**col as usize) < long.len()) {
+        let (agent, goal) = if turned { (col, row) } else { (row, col) };
+        goal_of[agent as usize] = goal;
+    }
+    let cost = compensated_sum(crate::pairs(&goal_of).map(|(agent, goal)| {
+        let (row, col) = if turned { (goal, agent) } else { (agent, goal) };
+        exact.terms(row, col)[0]
+    }));
+    Ok(Assignment { col_of_row: goal_of, cost })
+}
+
+pub(super) fn points_of<T: Copy + Into<f64>, const D: usize>(values: &[T]) -> Vec<[f64; D]> {
+    values.as_chunks::<D>().0.iter().map(|point| point.map(Into::into)).collect()
+}
+
+/// The pairs with costs of their own as the solver sees them: its rows are the shorter side.
+pub(super) fn own_costs<T, const D: usize>(
+    problem: &PointProblem<'_, T>,
+    agents: &[[f64; D]],
+    goals: &[[f64; D]],
+    metric: Metric,
+) -> OwnCosts {
+    let limited = |cost: f64| if cost <= metric.limit { cost } else { f64::INFINITY };
+    let place = |&(row, col, cost): &(u32, u32, f64)| OwnCost { row, col, terms: [limited(cost), 0.0], current: false };
+    let listed = OwnCosts::new(problem.costs.iter().map(place).collect(), agents.len());
+    let mut pairs = listed.pairs.clone();
+    for (row, col) in crate::pairs(problem.switching.current) {
+        let cost = listed.get(row, col).map_or_else(|| metric.cost(&agents[row], &goals[col]), |pair| pair.terms[0]);
+        if cost < f64::INFINITY {
+            let terms = [cost, -problem.switching.cost];
+            pairs.push(OwnCost { row: row as u32, col: col as u32, terms, current: true });
+        }
+    }
+    if agents.len() <= goals.len() {
+        return OwnCosts::new(pairs, agents.len());
+    }
+    pairs.iter_mut().for_each(|pair| (pair.row, pair.col) = (pair.col, pair.row));
+    OwnCosts::new(pairs, goals.len())
+}
+
+/// What a row without a column costs, above all that other pairs could save; none if no pair is forbidden.
+fn sink<const D: usize>(
+    own: &OwnCosts,
+    agents: &[[f64; D]],
+    goals: &[[f64; D]],
+    metric: Metric,
+) -> Result<Option<f64>, AssignError> {
+    let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
+    for point in agents.iter().chain(goals) {
+        for axis in 0..D {
+            (low[axis], high[axis]) = (low[axis].min(point[axis]), high[axis].max(point[axis]));
+        }
+    }
+    let diagonal = Metric { limit: f64::INFINITY, ..metric }.cost(&low, &high);
+    if diagonal > LARGEST_COST {
+        let problem = format!("distances to the power of {} are beyond 1e300; scale the positions", metric.power);
+        return Err(AssignError::invalid("power", problem));
+    }
+    let forbidden = own.pairs.iter().filter(|pair| pair.terms[0] == f64::INFINITY).count();
+    if forbidden == 0 && metric.limit == f64::INFINITY {
+        return Ok(None);
+    }
+    let mut span = Span { forbidden, least: 0.0, largest: diagonal.min(metric.limit) };
+    for pair in own.pairs.iter().filter(|pair| pair.terms[0] < f64::INFINITY) {
+        span.least = span.least.min(pair.cost());
+        span.largest = span.largest.max(pair.terms[0]);
+    }
+    Ok(Some(span.penalty(agents.len().min(goals.len()))))
+}
+
+/// The solver's rows and columns, in the order of their trees.
+struct Points<const D: usize> {
+    from: Vec<[f64; D]>,
+    tree: Tree<D>,
+    metric: Metric,
+    own: OwnCosts,
+    sink: Option<f64>,
+}
+
+impl<const D: usize> Candidates for Points<D> {
+    fn rows(&self) -> usize {
+        self.from.len()
+    }
+
+    fn cols(&self) -> usize {
+        self.tree.points().len()
+    }
+
+    fn sink(&self) -> Option<f64> {
+        self.sink
+    }
+
+    fn nearest(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
+        let own = self.own.of(row as usize);
+        // Those pairs would be counted twice; beyond the others they cost what they cost.
+        let from = &self.from[row as usize];
+        let bound = self.tree.nearest(from, count + own.len(), false, &self.metric, price, found);
+        if !own.is_empty() {
+            found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
+            for pair in own.iter().filter(|pair| pair.terms[0] < f64::INFINITY) {
+                let cost = pair.cost();
+                found.push(Found { reduced: cost - price[pair.col as usize], col: pair.col, cost });
+            }
+        }
+        bound
+    }
+
+    fn nearest_open(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
+        let own = self.own.of(row as usize);
+        let bound = self.tree.nearest(&self.from[row as usize], count + own.len(), true, &self.metric, price, found);
+        if !own.is_empty() {
+            found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
+        }
+        bound
+    }
+
+    fn close(&mut self, col: u32) {
+        self.tree.close(col);
+    }
+
+    fn reopen(&mut self, col: u32) {
+        self.tree.reopen(col);
+    }
+
+    fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>) {
+        let start = found.len();
+        self.tree.within(&self.from[row as usize], limit, &self.metric, price, found);
+        let own = self.own.of(row as usize);
+        if !own.is_empty() {
+            let others = found.split_off(start);
+            found.extend(others.into_iter().filter(|&col| self.own.get(row as usize, col as usize).is_none()));
+            let near = |pair: &&OwnCost| pair.cost() - price[pair.col as usize] <= limit;
+            found.extend(own.iter().filter(near).map(|pair| pair.col));
+        }
+    }
+
+    fn reprice(&mut self, price: &[f64]) {
+        self.tree.reprice(price);
+    }
+
+    fn cost(&self, row: u32, col: u32) -> f64 {
+        match self.own.get(row as usize, col as usize) {
+            Some(pair) => pair.cost(),
+            None => self.metric.cost(&self.from[row as usize], &self.tree.points()[col as usize]),
+        }
+    }
+}
+
+/// The costs in the order of the problem; the solver's rows are the shorter side.
+struct PointCosts<'a, const D: usize> {
+    from: &'a [[f64; D]],
+    to: &'a [[f64; D]],
+    metric: Metric,
+    own: &'a OwnCosts,
+    sink: f64,
+    turned: bool,
+}
+
+impl<const D: usize> Exact for PointCosts<'_, D> {
+    fn terms(&self, row: usize, col: usize) -> [f64; 2] {
+        let Some(to) = self.to.get(col) else {
+            return [self.sink, 0.0];
+        };
+        match self.own.get(row, col) {
+            Some(pair) => pair.terms,
+            None => [self.metric.cost(&self.from[row], to), 0.0],
+        }
+    }
+
+    fn current(&self, row: usize, col: usize) -> bool {
+        self.own.get(row, col).is_some_and(|pair| pair.current)
+    }
+
+    fn forbidden(&self, _: usize, col: usize) -> bool {
+        col >= self.to.len()
+    }
+
+    fn by_columns(&self) -> bool {
+        self.turned
+    }
+}

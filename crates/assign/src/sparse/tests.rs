@@ -1,0 +1,131 @@
+use super::pairs::{AllowedPairs, solve_pairs};
+use super::points::{Limit, PointProblem, check, matrix, solve_sparse};
+use super::threshold::bottleneck_sparse;
+use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
+use magex_core::rng::{Key, Purpose, Stream};
+
+/// Agents `[rows, dims]`, goals `[cols, dims]`, own costs, current pairs, switching cost.
+struct Case {
+    agents: Vec<f64>,
+    goals: Vec<f64>,
+    dims: usize,
+    power: f64,
+    costs: Vec<(u32, u32, f64)>,
+    current: Vec<u32>,
+    switching: f64,
+}
+
+impl Case {
+    fn draw(chance: &mut Stream, most: u32) -> Self {
+        let (rows, cols) = (1 + chance.below(most) as usize, 1 + chance.below(most) as usize);
+        let cols = if chance.below(3) == 0 { rows } else { cols };
+        let dims = 1 + chance.below(3) as usize;
+        // A grid with ties and duplicates, the unit cube, and clusters that are far apart.
+        let kind = chance.below(3);
+        let mut points = |count: usize| -> Vec<f64> {
+            let mut values = Vec::new();
+            for _ in 0..count {
+                let far = f64::from(chance.below(3)) * 1000.0;
+                for axis in 0..dims {
+                    values.push(match kind {
+                        0 => f64::from(chance.below(6)),
+                        1 => chance.uniform(),
+                        _ => chance.uniform() + if axis == 0 { far } else { 0.0 },
+                    });
+                }
+            }
+            values
+        };
+        let (agents, goals) = (points(rows), points(cols));
+        let power = [1.0, 2.0, 1.5, 1.0, 2.0, 3.0][chance.below(6) as usize];
+        let mut case = Self { agents, goals, dims, power, costs: Vec::new(), current: Vec::new(), switching: 0.0 };
+        if chance.below(2) == 0 {
+            for _ in 0..chance.below((rows * cols / 2 + 2) as u32) {
+                let (row, col) = (chance.below(rows as u32), chance.below(cols as u32));
+                let cost = if chance.below(3) == 0 { f64::from(chance.below(4)) } else { f64::INFINITY };
+                case.costs.push((row, col, cost));
+            }
+        }
+        if chance.below(2) == 0 {
+            let order = chance.permutation(cols);
+            let goal = |row: usize| order.get(row).copied().unwrap_or(UNASSIGNED);
+            case.current = (0..rows).map(|row| if row % 4 == 3 { UNASSIGNED } else { goal(row) }).collect();
+            case.switching = f64::from(chance.below(3)) * 0.5;
+        }
+        case
+    }
+
+    fn problem(&self) -> PointProblem<'_, f64> {
+        PointProblem {
+            power: self.power,
+            costs: &self.costs,
+            switching: Switching { current: &self.current, cost: self.switching },
+            ..PointProblem::new(&self.agents, &self.goals, self.dims)
+        }
+    }
+}
+
+fn compare(first: u32, count: u32, most: u32) {
+    let (mut solver, mut bottleneck) = (Solver::default(), BottleneckSolver::default());
+    for index in first..first + count {
+        let case = Case::draw(&mut Key::new(24, Purpose::Bench, &[index]).stream(), most);
+        let problem = case.problem();
+        let (rows, cols) = check(&problem).unwrap();
+        let cost = matrix(&problem).unwrap();
+        let expected = solver.solve_switching(&cost, rows, cols, &problem.switching, &|| true).unwrap();
+        let found = solve_sparse(&problem, rows, cols, Limit::NONE, &|| true).unwrap();
+        assert_eq!(found, expected, "points {index}");
+        let pairs: Vec<(u32, u32, f64)> =
+            (0..rows * cols).map(|place| ((place / cols) as u32, (place % cols) as u32, cost[place])).collect();
+        let allowed = AllowedPairs { rows, cols, pairs: &pairs, switching: problem.switching };
+        assert_eq!(solve_pairs(&allowed, &|| true).unwrap(), expected, "pairs {index}");
+        let problem = PointProblem { switching: Switching { cost: 0.0, ..problem.switching }, ..problem };
+        let expected = bottleneck.solve_switching(&cost, rows, cols, &problem.switching, &|| true).unwrap();
+        assert_eq!(bottleneck_sparse(&problem, rows, cols, &|| true).unwrap(), expected, "bottleneck {index}");
+    }
+}
+
+#[test]
+fn points_and_pairs_have_the_answers_of_the_matrix() {
+    compare(0, if cfg!(debug_assertions) { 600 } else { 3000 }, 8);
+    compare(10_000, 60, 60);
+    compare(20_000, if cfg!(debug_assertions) { 3 } else { 20 }, 300);
+}
+
+#[test]
+fn without_a_matrix_a_solver_that_is_told_to_stop_stops() {
+    let points: Vec<f64> = (0..2400).map(|k| f64::from(k * k % 97)).collect();
+    let problem = PointProblem::new(&points, &points, 2);
+    let stop = |calls: u32| {
+        let left = std::cell::Cell::new(calls);
+        move || {
+            left.set(left.get().saturating_sub(1));
+            left.get() > 0
+        }
+    };
+    for calls in [1, 3, 50] {
+        assert_eq!(super::solve_points(&problem, &stop(calls)), Err(crate::AssignError::Interrupted));
+        assert_eq!(super::bottleneck_points(&problem, &stop(calls.min(3))), Err(crate::AssignError::Interrupted));
+    }
+}
+
+#[test]
+fn bad_points_and_pairs_are_refused_and_named() {
+    let refuse = |problem: &PointProblem<'_, f64>| super::solve_points(problem, &|| true).unwrap_err().to_string();
+    let plain = PointProblem::new(&[0.0, 1.0], &[2.0, 3.0], 2);
+    assert!(refuse(&PointProblem { power: 0.5, ..plain }).starts_with("power: 0.5 is not"));
+    assert!(refuse(&PointProblem { costs: &[(0, 0, f64::NAN)], ..plain }).starts_with("costs[0]: NaN"));
+    assert!(refuse(&PointProblem { costs: &[(0, 1, 1.0)], ..plain }).contains("(0, 1) is not within 1 agents"));
+    assert!(refuse(&PointProblem { agents: &[0.0, 1e101], ..plain }).starts_with("agents[0][1]"));
+    let far = PointProblem { agents: &[0.0, 1e100], power: 16.0, ..plain };
+    assert!(refuse(&far).contains("beyond 1e300"), "{}", refuse(&far));
+    let current = Switching { current: &[1], cost: 0.0 };
+    assert!(refuse(&PointProblem { switching: current, ..plain }).starts_with("current[0]"));
+    let pairs = |pairs: &[(u32, u32, f64)]| {
+        let problem = AllowedPairs { rows: 1, cols: 1, pairs, switching: Switching::default() };
+        solve_pairs(&problem, &|| true)
+    };
+    assert!(pairs(&[(0, 0, f64::NEG_INFINITY)]).unwrap_err().to_string().starts_with("pairs[0]: -inf"));
+    assert!(pairs(&[(1, 0, 0.0)]).is_err());
+    assert_eq!(pairs(&[]).unwrap().col_of_row, [UNASSIGNED]);
+}

@@ -1,0 +1,241 @@
+//! The bottleneck assignment of points without a cost matrix.
+//!
+//! The smallest largest cost by bisection over costs that occur. Whether a threshold is enough is decided by augmenting paths in
+//! rounds (Pothen & Fan 1990), in which every column is taken from a tree of the columns when it is met, so that a round looks at
+//! every column once (Efrat, Itai & Katz 2001, "Geometry helps in bottleneck matching"). Where it is not enough, the cheapest
+//! pair that leads out of what was reached is the next candidate.
+
+use super::NONE;
+use super::costs::{Metric, OwnCost, OwnCosts};
+use super::points::{Limit, PointProblem, WORTH_IT, check, matrix, own_costs, points_of, solve_sparse};
+use super::tree::Tree;
+use crate::{AssignError, Assignment, BottleneckSolver, UNASSIGNED, pairs};
+
+/// As many pairs as possible, then the smallest largest cost, then as [`super::solve_points`]: the answer of
+/// [`BottleneckSolver::solve_switching`] of the matrix of costs, in memory that grows with the points only.
+/// With pairs in force and a switching cost, and with more than three coordinates, the matrix is used.
+pub fn bottleneck_points<T: Copy + Into<f64>>(
+    problem: &PointProblem<'_, T>,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
+    let (rows, cols) = check(problem)?;
+    let switching = &problem.switching;
+    let switches = switching.cost > 0.0 && pairs(switching.current).next().is_some();
+    if rows.max(cols) < WORTH_IT || problem.dims > 3 || switches {
+        let cost = matrix(problem)?;
+        return BottleneckSolver::default().solve_switching(&cost, rows, cols, switching, should_continue);
+    }
+    bottleneck_sparse(problem, rows, cols, should_continue)
+}
+
+/// Without the matrix, and without regard to a switching cost.
+pub(super) fn bottleneck_sparse<T: Copy + Into<f64>>(
+    problem: &PointProblem<'_, T>,
+    rows: usize,
+    cols: usize,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Assignment, AssignError> {
+    let limit = match problem.dims {
+        1 => threshold::<T, 1>(problem, should_continue)?,
+        2 => threshold::<T, 2>(problem, should_continue)?,
+        _ => threshold::<T, 3>(problem, should_continue)?,
+    };
+    match limit {
+        Some(limit) => solve_sparse(problem, rows, cols, limit, should_continue),
+        None => Ok(Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 }),
+    }
+}
+
+/// The smallest largest cost; nothing if all pairs are forbidden.
+fn threshold<T: Copy + Into<f64>, const D: usize>(
+    problem: &PointProblem<'_, T>,
+    should_continue: &dyn Fn() -> bool,
+) -> Result<Option<Limit>, AssignError> {
+    let metric = Metric { power: problem.power, limit: f64::INFINITY };
+    let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
+    let own = own_costs(problem, &agents, &goals, metric);
+    let (short, long) = if agents.len() > goals.len() { (&goals, &agents) } else { (&agents, &goals) };
+    let (tree, col_at) = Tree::new(long);
+    let (_, row_at) = Tree::new(short);
+    let mut place_of_col = vec![0; long.len()];
+    (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
+    let mut matching = Matching {
+        from: row_at.iter().map(|&row| short[row as usize]).collect(),
+        free: tree.clone(),
+        left: tree,
+        metric,
+        own: own.places(&row_at, &place_of_col),
+        col_of_row: vec![NONE; short.len()],
+        row_of_col: vec![NONE; long.len()],
+        reached: Vec::new(),
+    };
+    matching.search(should_continue)
+}
+
+/// A matching of pairs up to a threshold.
+struct Matching<const D: usize> {
+    from: Vec<[f64; D]>,
+    /// Columns that a round has not met yet, and those of them without a row.
+    left: Tree<D>,
+    free: Tree<D>,
+    metric: Metric,
+    own: OwnCosts,
+    col_of_row: Vec<u32>,
+    row_of_col: Vec<u32>,
+    /// Rows that the last round has reached in vain.
+    reached: Vec<u32>,
+}
+
+impl<const D: usize> Matching<D> {
+    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
+        let rows = self.from.len();
+        // The dearest of the rows' cheapest pairs is a lower bound.
+        let mut low = f64::NEG_INFINITY;
+        let mut complete = true;
+        for row in 0..rows as u32 {
+            match self.cheapest(row) {
+                Some(cost) => low = low.max(cost),
+                None => complete = false,
+            }
+        }
+        if low == f64::NEG_INFINITY {
+            return Ok(None);
+        }
+        let target = if self.own.is_empty() && complete {
+            rows
+        } else {
+            let pairs = self.grow(f64::INFINITY, should_continue)?;
+            if pairs < rows {
+                // Some rows stay without a column: their cheapest pairs say nothing.
+                low = f64::NEG_INFINITY;
+                for row in 0..rows as u32 {
+                    if let Some(cost) = self.cheapest(row) {
+                        low = if low == f64::NEG_INFINITY { cost } else { low.min(cost) };
+                    }
+                }
+            }
+            pairs
+        };
+        let mut high = f64::INFINITY;
+        let mut limit = low;
+        while low < high {
+            if self.grow(limit, should_continue)? == target {
+                high = self.largest();
+            } else {
+                // Something above the limit is needed.
+                low = self.next();
+                debug_assert!(low > limit, "a largest matching leads out only above the limit");
+            }
+            limit = if high == f64::INFINITY { low + 0.5 * low.abs() } else { low + 0.5 * (high - low) };
+            if limit >= high {
+                limit = low;
+            }
+        }
+        Ok(Some(Limit { cost: high, complete: target == rows }))
+    }
+
+    /// Makes the matching a largest one of pairs up to the limit; returns its size.
+    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError> {
+        let rows = self.from.len() as u32;
+        for row in 0..rows {
+            let col = self.col_of_row[row as usize];
+            if col != NONE && self.cost(row, col) > limit {
+                (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (NONE, NONE);
+            }
+        }
+        let mut path: Vec<(u32, u32)> = Vec::new();
+        loop {
+            if !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
+            self.left.restore();
+            self.free.restore();
+            for col in 0..self.row_of_col.len() as u32 {
+                if self.row_of_col[col as usize] != NONE {
+                    self.free.close(col);
+                }
+            }
+            self.reached.clear();
+            let (mut free, mut grown) = (0, 0);
+            for row in 0..rows {
+                if self.col_of_row[row as usize] != NONE {
+                    continue;
+                }
+                free += 1;
+                path.clear();
+                path.push((row, NONE));
+                while let Some(&(row, _)) = path.last() {
+                    let Some(col) = self.reach(row, limit) else {
+                        self.reached.push(row);
+                        path.pop();
+                        continue;
+                    };
+                    let owner = self.row_of_col[col as usize];
+                    if let Some(last) = path.last_mut() {
+                        last.1 = col;
+                    }
+                    if owner == NONE {
+                        for &(row, col) in &path {
+                            (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (col, row);
+                        }
+                        grown += 1;
+                        break;
+                    }
+                    path.push((owner, NONE));
+                }
+            }
+            if grown == 0 || grown == free {
+                return Ok(rows as usize - free + grown);
+            }
+        }
+    }
+
+    /// Takes a column that is left and not dearer than the limit: one without a row first, then the cheapest, which leaves the
+    /// matching mostly as it is when the limit falls.
+    fn reach(&mut self, row: u32, limit: f64) -> Option<u32> {
+        let Self { own, left, free, from, metric, .. } = self;
+        let (from, skip) = (&from[row as usize], |col: u32| own.get(row as usize, col as usize).is_some());
+        let listed = own.of(row as usize).iter();
+        let near = |pair: &&OwnCost| pair.terms[0] <= limit && pair.terms[0] < f64::INFINITY && left.is_open(pair.col);
+        let mut found = listed.clone().find(|pair| near(pair) && free.is_open(pair.col)).map(|pair| pair.col);
+        found = found.or_else(|| free.cheapest(from, metric, limit, skip).map(|found| found.0));
+        found = found.or_else(|| listed.clone().find(near).map(|pair| pair.col));
+        found = found.or_else(|| left.cheapest(from, metric, limit, skip).map(|found| found.0));
+        if let Some(col) = found {
+            left.close(col);
+            if free.is_open(col) {
+                free.close(col);
+            }
+        }
+        found
+    }
+
+    /// The cheapest pair of a row with a column that is left.
+    fn cheapest(&mut self, row: u32) -> Option<f64> {
+        let Self { own, left, from, metric, .. } = self;
+        let skip = |col: u32| own.get(row as usize, col as usize).is_some();
+        let found = left.cheapest(&from[row as usize], metric, f64::INFINITY, skip).map(|found| found.1);
+        let listed = own.of(row as usize).iter().filter(|pair| pair.terms[0] < f64::INFINITY && left.is_open(pair.col));
+        listed.map(|pair| pair.terms[0]).chain(found).min_by(f64::total_cmp)
+    }
+
+    /// The cheapest pair that leads out of what the last round has reached.
+    fn next(&mut self) -> f64 {
+        let reached = std::mem::take(&mut self.reached);
+        let next = reached.iter().filter_map(|&row| self.cheapest(row)).min_by(f64::total_cmp);
+        self.reached = reached;
+        next.unwrap_or(f64::INFINITY)
+    }
+
+    fn cost(&self, row: u32, col: u32) -> f64 {
+        match self.own.get(row as usize, col as usize) {
+            Some(pair) => pair.terms[0],
+            None => self.metric.cost(&self.from[row as usize], &self.left.points()[col as usize]),
+        }
+    }
+
+    fn largest(&self) -> f64 {
+        let pairs = (0u32..).zip(&self.col_of_row).filter(|(_, col)| **col != NONE);
+        pairs.map(|(row, &col)| self.cost(row, col)).fold(f64::NEG_INFINITY, f64::max)
+    }
+}
