@@ -117,7 +117,8 @@ impl Trainer {
             None if config.run.initial_weights.is_empty() => {}
             None => return Err(TrainError::NoParent(config.run.initial_weights.clone())),
         }
-        let place = || trainer.place.clone();
+        let own = trainer.place.clone();
+        let place = || own.clone();
         let (metrics, events) = (MetricsFile::create(trainer.disk.clone(), place())?, EventFile::new(place(), None));
         trainer.observe(metrics);
         trainer.observe(events);
@@ -163,7 +164,8 @@ impl Trainer {
             trainer.change(&changes, &mut progress)?;
         }
         if trainer.complete.is_none() {
-            let place = || trainer.place.clone();
+            let own = trainer.place.clone();
+            let place = || own.clone();
             let (metrics, missing) = MetricsFile::reopen(trainer.disk.clone(), place(), progress.iteration)?;
             let events = EventFile::new(place(), Some(progress.joint_env_steps));
             if !missing.is_empty() {

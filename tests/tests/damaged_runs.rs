@@ -1,6 +1,6 @@
 //! Damaged run folders, the same ones every time: refused by name, or continued with the same numbers and whole lines, those that
 //! are missing named. `fuzz/` has the same target with coverage.
-#![allow(clippy::print_stdout, reason = "counts of a long test")]
+#![allow(clippy::panic, clippy::print_stdout, reason = "counts of a long test, and the input that fails")]
 
 use magex_core::rng::{Key, Purpose};
 use magex_tests::decoders::run_folder::{RunFolder, Verdict};

@@ -219,7 +219,8 @@ fn without_one_of_its_syncs_a_run_would_lose_something() {
     let whole = Trace::record(&known, root.path());
     let below = |path: &Path, folder: &str| path.parent() == Some(Path::new(folder));
     let unfinished = |path: &Path| path.extension().is_some_and(|end| end == "tmp");
-    let cases: [(&str, &dyn Fn(&Path) -> bool); 7] = [
+    type Case<'a> = (&'a str, &'a dyn Fn(&Path) -> bool);
+    let cases: [Case<'_>; 7] = [
         ("the folder that the run is in", &|path| path == Path::new("")),
         ("the run folder", &|path| path == Path::new("run")),
         ("config.toml", &|path| path == Path::new("run/.config.toml.tmp")),

@@ -78,7 +78,7 @@ impl Played {
         let patience = Duration::from_secs(60);
         let ended = self.runtime.block_on(async { tokio::time::timeout(patience, self.running).await });
         self.runtime.shutdown_background();
-        ended.expect("the actor ends").unwrap()
+        ended.unwrap().unwrap()
     }
 }
 
@@ -99,7 +99,7 @@ fn recomputing(share: &str) -> Setup {
 fn survives(config: &RunConfig, what: &str, spoil: Spoil, said: &str, recompute: &str) {
     let mut cluster = Cluster::start_with(config, recomputing(recompute));
     let bad = Played::start(&cluster, cluster.commander_address(), "spoiler", Duration::ZERO, spoil);
-    let error = bad.end().expect_err("it is evicted").to_string();
+    let error = bad.end().unwrap_err().to_string();
     assert!(error.contains("evicted this actor") && error.contains(said), "{what}: {error}");
     cluster.start_actor();
     assert_eq!(cluster.finish(), undisturbed(config), "{what}");

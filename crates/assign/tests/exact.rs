@@ -1,5 +1,6 @@
 //! The solvers against exact rational arithmetic: every matching of small problems is visited, and its cost is summed without
 //! rounding. The quick part runs in every test; the long one is named in .ci/long.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
 #[path = "exact/problems.rs"]
 mod problems;

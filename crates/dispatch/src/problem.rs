@@ -326,8 +326,7 @@ pub(crate) fn single_precision(values: &[f32], path: impl Fn() -> String) -> Res
 
 /// Checks coordinates; `path` is the field of each.
 pub(crate) fn coordinates(values: &[f64], path: impl Fn(usize) -> String) -> Result<(), ConvertError> {
-    // False for NaN.
-    let wrong = values.iter().position(|value| !(value.abs() <= LARGEST_COORDINATE));
+    let wrong = values.iter().position(|value| value.is_nan() || value.abs() > LARGEST_COORDINATE);
     let Some(place) = wrong else { return Ok(()) };
     let problem = format!("{} is not a finite number up to {LARGEST_COORDINATE:e} in magnitude", values[place]);
     Err(ConvertError::new(path(place), problem))

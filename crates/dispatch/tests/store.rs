@@ -304,7 +304,8 @@ fn a_file_that_another_commander_uses_is_not_taken_from_it() {
     theirs.insert(make("2", "you")).unwrap();
     std::thread::sleep(PAUSE);
     missions.insert(make("1", "me")).unwrap();
-    (missions.close(), theirs.close());
+    missions.close();
+    theirs.close();
     let names = |path| Disk::open(path).unwrap().load().unwrap().iter().map(|m| m.id().to_owned()).collect::<Vec<_>>();
     assert_eq!((names(&own), names(&other)), (vec!["1".to_owned()], vec!["2".to_owned()]));
 }

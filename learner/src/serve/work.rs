@@ -169,7 +169,7 @@ impl Work {
     #[cfg(test)]
     pub(crate) fn poll(&self, waiting: &mut dyn Waiting) -> Option<Result<CollectedPlan, CollectError>> {
         let mut open = self.open.lock();
-        let end = match look(&mut open, waiting, &take) {
+        let end = match look(&mut open, waiting, take) {
             Look::Open => return None,
             Look::Ended(end) => end,
             Look::Case(check) => {

@@ -250,7 +250,7 @@ impl Mappo {
                 let input = slice.input(&features, policy_hidden.clone(), slice.noise());
                 let now = policy.evaluate(&input, &slice.actions())?;
                 let differences = (now.log_probs - slice.column(&batch.log_probs)?)?.to_vec1::<f32>()?;
-                out.error = differences.into_iter().fold(out.error, |worst, x| worse(worst, x));
+                out.error = differences.into_iter().fold(out.error, worse);
                 policy_hidden = last_state(now.states.as_ref(), policy_hidden)?;
             }
             start += count;

@@ -91,7 +91,7 @@ impl<C: Candidates> Engine<C> {
                     break 'path (id, length);
                 }
                 known.finals.push(id);
-                if known.finals.len() % 4096 == 0 && !should_continue() {
+                if known.finals.len().is_multiple_of(4096) && !should_continue() {
                     return Err(AssignError::Interrupted);
                 }
                 offset = self.own(owner) - length;

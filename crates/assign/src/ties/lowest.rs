@@ -187,7 +187,7 @@ impl<'a> Choice<'a> {
     /// Whether everyone who has to make room for `agent` at `goal` finds another place; `asked_by` and `takes` then lead there.
     fn can_have(&mut self, agent: u32, goal: u32, round: u32, forbidden: &dyn Fn(usize, usize) -> bool) -> bool {
         self.queue.clear();
-        if self.ask(self.agent_of[goal as usize], agent, NONE, goal, round, forbidden) {
+        if self.ask(self.agent_of[goal as usize], agent, NONE, goal, round) {
             return true;
         }
         let mut head = 0;
@@ -202,7 +202,7 @@ impl<'a> Choice<'a> {
             if target != NONE && goals.of(asked as usize).binary_search(&target).is_ok() {
                 // The shortest way first: it ends most searches at once.
                 let allowed = !restricted || forbidden(asked as usize, target as usize);
-                if allowed && self.ask(agent, agent, asked, target, round, forbidden) {
+                if allowed && self.ask(agent, agent, asked, target, round) {
                     return true;
                 }
             }
@@ -210,7 +210,7 @@ impl<'a> Choice<'a> {
                 if goal == own || (restricted && !forbidden(asked as usize, goal as usize)) {
                     continue;
                 }
-                if self.ask(self.agent_of[goal as usize], agent, asked, goal, round, forbidden) {
+                if self.ask(self.agent_of[goal as usize], agent, asked, goal, round) {
                     return true;
                 }
             }
@@ -219,7 +219,7 @@ impl<'a> Choice<'a> {
                 self.idle_reached = round;
                 for other in 0..self.goal_of.len() as u32 {
                     let without = self.goal_of[other as usize] == NONE && !self.goals.of(other as usize).is_empty();
-                    if without && self.ask(other, agent, asked, NONE, round, forbidden) {
+                    if without && self.ask(other, agent, asked, NONE, round) {
                         return true;
                     }
                 }
@@ -229,15 +229,7 @@ impl<'a> Choice<'a> {
     }
 
     /// Puts the holder of a goal that `by` would take into the queue; true if it is the agent that began.
-    fn ask(
-        &mut self,
-        holder: u32,
-        first: u32,
-        by: u32,
-        goal: u32,
-        round: u32,
-        forbidden: &dyn Fn(usize, usize) -> bool,
-    ) -> bool {
+    fn ask(&mut self, holder: u32, first: u32, by: u32, goal: u32, round: u32) -> bool {
         if holder == NONE {
             // A goal without an agent: instead, a goal that may stay alone loses its agent.
             let Some(spare) = self.spare.filter(|_| self.spare_reached != round) else {
@@ -246,7 +238,7 @@ impl<'a> Choice<'a> {
             self.spare_reached = round;
             for other in 0..self.goal_of.len() as u32 {
                 let own = self.goal_of[other as usize];
-                if own != NONE && spare[own as usize] && self.ask(other, first, by, goal, round, forbidden) {
+                if own != NONE && spare[own as usize] && self.ask(other, first, by, goal, round) {
                     return true;
                 }
             }

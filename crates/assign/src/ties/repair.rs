@@ -46,8 +46,8 @@ pub(super) fn repair(
     let input = Input { tied, parts, exact, unit: scale.unit(), switches };
     match bits {
         ..=128 => Repair::<2>::run(&input, solution, should_continue),
-        ..=256 => Repair::<4>::run(&input, solution, should_continue),
-        ..=640 => Repair::<10>::run(&input, solution, should_continue),
+        129..=256 => Repair::<4>::run(&input, solution, should_continue),
+        257..=640 => Repair::<10>::run(&input, solution, should_continue),
         // All doubles there are.
         _ => Repair::<36>::run(&input, solution, should_continue),
     }

@@ -100,13 +100,11 @@ impl DataFile {
         if let Err(redb::DatabaseError::DatabaseAlreadyOpen) = locked {
             return Err(DiskError::InUse);
         }
-        let aside = (1..).map(|number| self.path.with_extension(format!("redb.found-{number}")));
-        for aside in aside.take(1000).filter(|aside| !aside.exists()) {
-            fs::rename(&self.path, &aside).map_err(io)?;
-            tracing::warn!(file = %aside.display(), "another file was in the place of the missions; it is kept here");
-            return Ok(());
-        }
-        Err(io(Error::from(ErrorKind::AlreadyExists)))
+        let mut names = (1..1000).map(|number| self.path.with_extension(format!("redb.found-{number}")));
+        let aside = names.find(|aside| !aside.exists()).ok_or_else(|| io(Error::from(ErrorKind::AlreadyExists)))?;
+        fs::rename(&self.path, &aside).map_err(io)?;
+        tracing::warn!(file = %aside.display(), "another file was in the place of the missions; it is kept here");
+        Ok(())
     }
 }
 

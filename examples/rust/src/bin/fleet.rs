@@ -70,7 +70,12 @@ impl World {
         let mut draw = Draw(1);
         let mut robot = |_| Robot { place: draw.point(), speed: 1.0 + draw.next(), busy_until: 0.0 };
         let robots = (0..ROBOTS).map(&mut robot).collect();
-        let arrivals = (0..SECONDS).filter_map(|t| (draw.next() < RATE).then(|| (t, draw.point()))).collect();
+        let mut arrivals = Vec::new();
+        for second in 0..SECONDS {
+            if draw.next() < RATE {
+                arrivals.push((second, draw.point()));
+            }
+        }
         Self { robots, arrivals, open: BTreeMap::new(), waited: Vec::new() }
     }
 
