@@ -4,6 +4,7 @@
 mod finish;
 mod outcome;
 mod plan;
+mod room;
 mod saving;
 mod target;
 mod trust;
@@ -11,6 +12,7 @@ mod trust;
 use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
 pub use plan::{EVAL_SET_FINAL, EVAL_SET_TRAINING, max_shard_episodes};
+use room::{check_buffer, pool};
 
 use crate::checkpoint::disk::{Disk, FileSystem, Place, replace_file};
 use crate::checkpoint::{self, CheckpointError, Progress};
@@ -28,7 +30,6 @@ use crate::run_start::{Changes, Parent, continued};
 use crate::train::algorithm::Algorithm;
 use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
-use crate::train::replay::Replay;
 use crate::train::stats::UpdateStats;
 use crate::train::suspect::UpdateError;
 use magex_core::config::RunConfig;
@@ -485,39 +486,6 @@ impl Trainer {
 
     fn wall_s(&self) -> f64 {
         self.progress.wall_s + self.started.elapsed().as_secs_f64()
-    }
-}
-
-/// Refuses a replay buffer that will not fit into memory when it is full: hours later, the run would be killed.
-fn check_buffer(config: &RunConfig) -> Result<(), TrainError> {
-    if !config.run.algorithm.off_policy() {
-        return Ok(());
-    }
-    let (episodes, needed) = (config.qmix.buffer_episodes, Replay::bytes(config));
-    match magex_runtime::limits::available_memory() {
-        Some(available) if available < needed => {
-            let fit = (available / 2 / Replay::episode_bytes(config)).max(1);
-            Err(TrainError::Buffer { episodes, needed, available, fit })
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Training threads: as many as can be started, up to `most`. Their number changes no number of the run.
-fn pool(most: usize) -> Result<rayon::ThreadPool, TrainError> {
-    let build = |threads| {
-        let builder = rayon::ThreadPoolBuilder::new().num_threads(threads).stack_size(64 << 20);
-        builder.thread_name(|i| format!("magex-train-{i}")).build()
-    };
-    let mut threads = most;
-    loop {
-        match build(threads) {
-            Err(error) if threads > 1 => {
-                threads /= 2;
-                tracing::warn!(%error, threads, "not all training threads can be started; trying with fewer");
-            }
-            built => return built.map_err(|error| TrainError::Threads(error.to_string())),
-        }
     }
 }
 

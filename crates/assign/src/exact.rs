@@ -6,13 +6,13 @@
 //!
 //! Floating point: row prices are never stored (they follow from the matched entry), a repricing that rounds to nothing
 //! does not count as progress, and the number of displacements is bounded, so no input can cycle. What rounding leaves open is
-//! decided without it afterwards ([`crate::ties`]).
+//! decided without it afterwards (`ties`).
 
 mod problem;
 mod shortlist;
 
 use crate::ties::{self, Graph, NONE, Solution};
-use crate::{AssignError, Assignment, PointProblem, Switching, UNASSIGNED, check_costs, cost_of, solve_points};
+use crate::{AssignError, Assignment, Switching, UNASSIGNED, check_costs, cost_of};
 use problem::Matrix;
 use shortlist::{Shortlists, WORTH_IT};
 
@@ -59,17 +59,6 @@ struct Branch {
     col: u32,
     /// Length of the path to that column.
     length: f64,
-}
-
-/// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
-/// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
-pub fn exact_points<T: Copy + Into<f64>>(
-    agents: &[T],
-    goals: &[T],
-    dims: usize,
-) -> Result<(Vec<u32>, f64), AssignError> {
-    let answer = solve_points(&PointProblem::new(agents, goals, dims), &|| true)?;
-    Ok((answer.col_of_row, answer.cost))
 }
 
 impl Solver {

@@ -21,7 +21,7 @@
 //!    the highest.
 //!
 //! Costs are the doubles that are given, and their sums are compared as if they were added without rounding: 0.1 + 0.2 is more
-//! than 0.3, because these doubles are. Whoever wants sums of decimals to tie gives whole numbers, for example cents. Neither the
+//! than 0.3, because these doubles are. Give whole numbers where sums of decimals should tie, for example cents. Neither the
 //! range of the costs nor the size of the problem matters, so a pair of 10^50 that cannot be avoided leaves the others exact.
 //! There is one answer to every problem, the same from every solver of this crate; [`solve_points`] names the only exception.
 
@@ -45,12 +45,12 @@ mod switching;
 mod ties;
 
 pub use bottleneck::BottleneckSolver;
-pub use exact::{Solver, exact_points};
+pub use exact::Solver;
 pub use greedy::greedy;
 pub use points::{
     LARGEST_COORDINATE, POWERS, cost_of_points, costs_into, distance, distances_into, powered, powered_square,
 };
-pub use sparse::{AllowedPairs, PointProblem, bottleneck_points, solve_pairs, solve_points};
+pub use sparse::{AllowedPairs, PointProblem, bottleneck_points, exact_points, solve_pairs, solve_points};
 pub use switching::Switching;
 
 /// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).

@@ -20,7 +20,7 @@ use crate::ties::{self, Exact, Graph, NONE, Solution};
 use candidates::{Candidates, Engine};
 
 pub use pairs::{AllowedPairs, solve_pairs};
-pub use points::{PointProblem, solve_points};
+pub use points::{PointProblem, exact_points, solve_points};
 pub use threshold::bottleneck_points;
 
 /// Nearly tight pairs per row, on average, beyond which they are not collected: points on a line have nearly as many as there

@@ -1,4 +1,4 @@
-//! Nearly the final prices: rows bid for their cheapest column, and who is outbid bids again.
+//! Nearly the final prices: rows bid for their cheapest column, and a row that is outbid bids again.
 
 use super::NONE;
 use super::candidates::{Candidates, Engine};

@@ -86,7 +86,7 @@ impl<C: Candidates> Engine<C> {
         self.changes += 1;
     }
 
-    /// Brings the source's prices up to date, if more than so many have changed.
+    /// Brings the source's prices up to date, if more than a given number have changed.
     pub(super) fn reprice(&mut self, most: usize) {
         if self.changes > most {
             self.source.reprice(&self.price);

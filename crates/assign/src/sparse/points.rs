@@ -93,6 +93,17 @@ pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Resul
     Ok((rows, cols))
 }
 
+/// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
+/// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
+pub fn exact_points<T: Copy + Into<f64>>(
+    agents: &[T],
+    goals: &[T],
+    dims: usize,
+) -> Result<(Vec<u32>, f64), AssignError> {
+    let answer = solve_points(&PointProblem::new(agents, goals, dims), &|| true)?;
+    Ok((answer.col_of_row, answer.cost))
+}
+
 /// Without the matrix; pairs that cost more than the limit are forbidden.
 pub(super) fn solve_sparse<T: Copy + Into<f64>>(
     problem: &PointProblem<'_, T>,

@@ -9,7 +9,7 @@ use super::{Exact, Graph, NONE, Solution};
 use crate::AssignError;
 use std::borrow::Cow;
 
-/// Searches look at so many times the pairs there are, before the graph is cleared up.
+/// Searches look at this many times the pairs there are, before the graph is cleared up.
 const LOOKS: usize = 4;
 
 /// Makes the solution the lowest matching of tight pairs; `spare` `[cols]` are the columns that may stay alone at no cost.
@@ -184,7 +184,7 @@ impl<'a> Choice<'a> {
         self.closed[agent] = goal != NONE && !forbidden(agent, goal as usize);
     }
 
-    /// Whether everyone who has to make room for `agent` at `goal` finds another place; `asked_by` and `takes` then lead there.
+    /// Whether every agent that has to make room for `agent` at `goal` finds another place; `asked_by` and `takes` then lead there.
     fn can_have(&mut self, agent: u32, goal: u32, round: u32, forbidden: &dyn Fn(usize, usize) -> bool) -> bool {
         self.queue.clear();
         if self.ask(self.agent_of[goal as usize], agent, NONE, goal, round) {

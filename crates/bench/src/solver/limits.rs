@@ -11,7 +11,7 @@ use std::process::{Command, Stdio};
 use std::time::Instant;
 
 const SCRIPT: &str = include_str!("../../peers/solver/solve.py");
-/// The least of so many runs counts: other programs can only make one longer.
+/// The least of this many runs counts: other programs can only make one longer.
 const RUNS: usize = 3;
 
 /// What a row solves.
@@ -236,7 +236,7 @@ fn line(n: usize) -> Input {
     Input::Points(agents, goals, 1.0)
 }
 
-/// Whole numbers from 0 on, so many different ones.
+/// Whole numbers from 0 on, this many different ones.
 fn integers(n: usize, values: u32) -> Input {
     let mut stream = stream(2);
     Input::Matrix((0..n * n).map(|_| f64::from(stream.below(values))).collect(), n)
