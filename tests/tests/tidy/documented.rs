@@ -63,6 +63,7 @@ fn messages_that_the_failure_table_quotes_exist() {
     let sources: String = product.map(|file| read(&file.to_string_lossy())).collect();
     let page = read("docs/operations.md");
     let (_, table) = page.split_once("## Failure by failure").unwrap();
+    let table = table.split("\n## ").next().unwrap();
     for row in table.lines().filter(|line| line.starts_with("| ")).skip(1) {
         let symptom = row.split(" | ").nth(1).unwrap_or_default();
         for quoted in symptom.split('`').skip(1).step_by(2) {
