@@ -1,7 +1,7 @@
 //! Logs on standard error, and traces to a collector when asked for.
 
 use crate::client;
-use crate::exit::Failure;
+use crate::exit::{self, Failure};
 use crate::log_line;
 pub use crate::log_line::{is_json, line};
 use crate::trace;
@@ -14,8 +14,8 @@ use opentelemetry_sdk::trace::{BatchConfigBuilder, BatchSpanProcessor, SdkTracer
 use std::io::IsTerminal as _;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
-use tracing::{Metadata, Subscriber};
-use tracing_subscriber::filter::{EnvFilter, FilterExt as _, filter_fn};
+use tracing::Subscriber;
+use tracing_subscriber::filter::{EnvFilter, LevelFilter, Targets};
 use tracing_subscriber::layer::{Layer, SubscriberExt as _};
 use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt as _;
@@ -80,47 +80,53 @@ impl Telemetry {
 /// A collector that does not answer is no error: spans are dropped.
 pub fn init(service: &str, format: LogFormat, args: &TraceArgs) -> Result<Telemetry, Failure> {
     let traces = args.otlp.as_deref().map(|url| provider(service, url)).transpose()?;
-    let spans = traces.as_ref().map(|traces| {
-        tracing_opentelemetry::layer()
-            .with_tracer(traces.tracer("magex"))
-            .with_location(false)
-            .with_threads(false)
-            .with_tracked_inactivity(false)
-            .with_filter(filter_fn(is_traced))
-    });
     format.apply();
+    let filter = filter("info")?;
     // A second call changes nothing.
-    let _ = tracing_subscriber::registry().with(logs(format, filter("info")?)).with(spans).try_init();
+    let _ = match &traces {
+        None => logging(format, filter).try_init(),
+        Some(traces) => {
+            let spans = tracing_opentelemetry::layer()
+                .with_tracer(traces.tracer("magex"))
+                .with_location(false)
+                .with_threads(false)
+                .with_tracked_inactivity(false)
+                .with_filter(Targets::new().with_target(trace::TARGET, LevelFilter::INFO));
+            tracing_subscriber::registry().with(lines(format).with_filter(filter)).with(spans).try_init()
+        }
+    };
     Ok(Telemetry { traces })
 }
 
-fn is_traced(metadata: &Metadata<'_>) -> bool {
-    metadata.target() == trace::TARGET
+/// Logs alone. The filter is the subscriber's, not the layer's, and there is no layer that is `None`: only then does a span that is not
+/// logged cost one comparison. Otherwise the network libraries' spans, dozens for a call, are all made and dropped.
+fn logging(format: LogFormat, filter: EnvFilter) -> impl Subscriber + Send + Sync {
+    tracing_subscriber::registry().with(filter).with(lines(format))
 }
 
-/// What is logged: what RUST_LOG says, or `default`.
+/// What is logged: what RUST_LOG says, or `default`; the spans of [`trace::TARGET`] never are.
 ///
 /// # Errors
 /// RUST_LOG is wrong.
 pub fn filter(default: &str) -> Result<EnvFilter, Failure> {
-    let Some(wanted) = std::env::var_os(EnvFilter::DEFAULT_ENV) else { return Ok(EnvFilter::new(default)) };
-    let wanted = wanted.to_string_lossy();
-    EnvFilter::try_new(&*wanted).map_err(|_| {
+    let wanted = std::env::var_os(EnvFilter::DEFAULT_ENV).map(|wanted| wanted.to_string_lossy().into_owned());
+    let filter = EnvFilter::try_new(wanted.as_deref().unwrap_or(default)).map_err(|_| {
+        let wanted = wanted.as_deref().unwrap_or(default);
         Failure::usage(format!(
             "RUST_LOG: '{wanted}' is no list of filters; write for example info, or info,magex_learner=debug"
         ))
-    })
+    })?;
+    let traced = format!("{}=off", trace::TARGET).parse().map_err(|error| Failure::new(exit::INTERNAL, error))?;
+    Ok(filter.add_directive(traced))
 }
 
-fn logs<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat, filter: EnvFilter) -> impl Layer<S> {
+fn lines<S: Subscriber + for<'a> LookupSpan<'a>>(format: LogFormat) -> Box<dyn Layer<S> + Send + Sync> {
     // An error would be printed where it occurred, and a thread that cannot print panics: a closed terminal, a full disk.
     let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).log_internal_errors(false);
-    let lines = match format {
+    match format {
         LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).with_target(false).boxed(),
         LogFormat::Json => lines.json().flatten_event(true).boxed(),
-    };
-    // Spans of traces are not logged, whatever RUST_LOG says.
-    lines.with_filter(filter.and(filter_fn(|metadata| !is_traced(metadata))))
+    }
 }
 
 fn provider(service: &str, url: &str) -> Result<SdkTracerProvider, Failure> {
@@ -182,6 +188,15 @@ mod tests {
         flushing.await.unwrap();
         // Generous: it is seconds where it could be minutes.
         assert!(start.elapsed() < Duration::from_secs(30), "{:?}", start.elapsed());
+    }
+
+    #[test]
+    fn spans_of_the_libraries_are_not_made_unless_they_are_logged() {
+        tracing::subscriber::with_default(logging(LogFormat::Text, EnvFilter::new("info,magex_trace=off")), || {
+            assert!(tracing::info_span!("logged").id().is_some());
+            assert!(tracing::debug_span!("not logged").id().is_none());
+            assert!(tracing::info_span!(target: trace::TARGET, "exported").id().is_none());
+        });
     }
 
     #[tokio::test]
