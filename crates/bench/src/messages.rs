@@ -163,7 +163,7 @@ fn matrix() -> Bytes {
 
 /// More agents than a team may have.
 fn positions() -> Bytes {
-    let points = || Some(v1::Positions { dims: 2, coordinates: vec![1.0; LENGTH / 8], ..Default::default() });
+    let points = || Some(v1::Positions { dims: 2, coordinates: vec![1.0; LENGTH / 16], ..Default::default() });
     encoded(&v1::AssignRequest { agents: points(), goals: points(), ..Default::default() })
 }
 
