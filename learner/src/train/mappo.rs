@@ -18,6 +18,9 @@
 //! | 13 | log-probabilities that the first minibatch (with memories: every chunk) does not reproduce refuse the batch before anything is changed | ours |
 //! | 14 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
+mod sums;
+
+use self::sums::{PolicySums, Totals};
 use crate::train::batch::{Batch, Slice, column, sum_of_rows};
 use crate::train::gae::{Gae, ValueNorm};
 use crate::train::learned::{Learned, Network};
@@ -388,54 +391,6 @@ fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Res
     networks.iter().zip(variables).map(flat).collect()
 }
 
-/// Sums over rows, in order and in double precision.
-#[derive(Debug, Clone, Copy, Default)]
-struct PolicySums {
-    loss: f64,
-    entropy: f64,
-    /// Rows whose ratio is outside 1 ± ε.
-    clipped: f64,
-    /// Σ (ρ − 1 − ln ρ), the estimator of the KL divergence from the old policy (Schulman's k3).
-    kl: f64,
-    /// max |ρ − 1|.
-    ratio_error: f64,
-    /// max |ln ρ|, and its row.
-    worst: (f64, usize),
-}
-
-impl PolicySums {
-    fn of(surrogate: &Tensor, entropies: &Tensor, ratio: &Tensor, log_ratio: &Tensor, clip: f32) -> Result<Self> {
-        let mut sums = Self { loss: -sum(surrogate)?, entropy: sum(entropies)?, ..Self::default() };
-        for (row, (ratio, log_ratio)) in
-            ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?).enumerate()
-        {
-            let error = worse(sums.worst.0, log_ratio);
-            if error > sums.worst.0 {
-                sums.worst = (error, row);
-            }
-            sums.clipped += f64::from(u8::from((ratio - 1.0).abs() > clip));
-            sums.kl += f64::from(ratio - 1.0 - log_ratio);
-            sums.ratio_error = sums.ratio_error.max(f64::from((ratio - 1.0).abs()));
-        }
-        Ok(sums)
-    }
-
-    /// Of rows that stand for several samples each.
-    fn times(self, weight: f64) -> Self {
-        let Self { loss, entropy, clipped, kl, ratio_error, worst } = self;
-        let [loss, entropy, clipped, kl] = [loss, entropy, clipped, kl].map(|sum| sum * weight);
-        Self { loss, entropy, clipped, kl, ratio_error, worst }
-    }
-
-    fn add(&mut self, other: &Self) {
-        self.loss += other.loss;
-        self.entropy += other.entropy;
-        self.clipped += other.clipped;
-        self.kl += other.kl;
-        self.ratio_error = self.ratio_error.max(other.ratio_error);
-    }
-}
-
 /// The larger of an error and |x|; infinite if x is no number.
 fn worse(error: f64, x: f32) -> f64 {
     if x.is_nan() { f64::INFINITY } else { error.max(f64::from(x.abs())) }
@@ -447,39 +402,6 @@ fn check_log_probs(episode: usize, error: f64) -> std::result::Result<(), Suspec
         return Ok(());
     }
     Err(Suspect { trajectory: episode, field: "log_probs", error, limit: LOG_PROB_TOLERANCE })
-}
-
-/// Sums over the minibatches of an update.
-#[derive(Default)]
-struct Totals {
-    minibatches: f64,
-    /// Policy loss, value loss, entropy, clip fraction, KL divergence.
-    means: [f64; 5],
-    /// Norm of each network's gradient before clipping.
-    grad_norms: Vec<f64>,
-    first_ratio_error: f64,
-    skipped: f64,
-}
-
-impl Totals {
-    fn minibatch(&mut self, policy: &PolicySums, value: f64, norms: &[f64], samples: f64) {
-        self.minibatches += 1.0;
-        let sums = [policy.loss, value, policy.entropy, policy.clipped, policy.kl];
-        self.means.iter_mut().zip(sums).for_each(|(mean, sum)| *mean += sum / samples);
-        self.grad_norms.iter_mut().zip(norms).for_each(|(total, norm)| *total += norm);
-    }
-
-    fn stats(self, parts: &[Part]) -> UpdateStats {
-        let count = self.minibatches.max(1.0);
-        let mut stats = UpdateStats::default();
-        let names = ["policy_loss", "value_loss", "entropy", "clip_fraction", "approx_kl"];
-        names.into_iter().zip(self.means).for_each(|(name, sum)| stats.push(name, sum / count));
-        stats.push("first_ratio_error", self.first_ratio_error);
-        let norms = parts.iter().zip(&self.grad_norms);
-        norms.for_each(|(part, sum)| stats.push(format!("{}_grad_norm", part.name), sum / count));
-        stats.push("skipped_minibatches", self.skipped);
-        stats
-    }
 }
 
 /// (A − mean) / (standard deviation + 1e-5) over all samples.

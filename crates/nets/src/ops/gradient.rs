@@ -2,11 +2,14 @@
 //! however many rows come at once.
 
 use super::matmul::Rows;
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
 /// Rows that pass over a tile of sums while it is in registers: x and dz of so many stay in the first cache level.
 const BLOCK: usize = 64;
+
+/// Vectors of a row of sums that are in registers at once, at most.
+const VECTORS: usize = if WIDE { 4 } else { 1 };
 
 /// Sums of one layer.
 pub(crate) struct Gradient {
@@ -44,9 +47,9 @@ impl Gradient {
                 store(sum, &mut self.db[v..]);
             }
             if self.transposed {
-                block(dz, n, x, k, &mut self.dw, count);
+                block(dz, n, x, k, &mut self.dw, count, VECTORS);
             } else {
-                block(x, k, dz, padded, &mut self.dw, count);
+                block(x, k, dz, padded, &mut self.dw, count, VECTORS);
             }
             first += count;
         }
@@ -71,10 +74,10 @@ impl Gradient {
 }
 
 /// sums [k, width] += xᵀ · dz for a block of rows; `width` is a multiple of the vectors' length.
-fn block(x: Rows<'_>, k: usize, dz: Rows<'_>, width: usize, sums: &mut [f32], rows: usize) {
+fn block(x: Rows<'_>, k: usize, dz: Rows<'_>, width: usize, sums: &mut [f32], rows: usize, most: usize) {
     let mut column = 0;
     while column < width {
-        let left = (width - column) / LANES;
+        let left = most.min((width - column) / LANES);
         let dz = dz.from_column(column);
         if left >= 4 {
             columns::<4>(x, k, dz, &mut sums[column..], width, rows);
@@ -94,7 +97,7 @@ fn columns<const Q: usize>(x: Rows<'_>, k: usize, dz: Rows<'_>, sums: &mut [f32]
     let mut i = 0;
     while i < k {
         let (left, x, sums) = (k - i, x.from_column(i), &mut sums[i * width..]);
-        i += if Q < 4 && left >= 8 {
+        i += if WIDE && Q < 4 && left >= 8 {
             tile8::<Q>(x, dz, sums, width, rows);
             8
         } else if left >= 6 && left != 8 {
@@ -139,3 +142,22 @@ tile!(tile1, 1, 0);
 tile!(tile4, 4, 0 1 2 3);
 tile!(tile6, 6, 0 1 2 3 4 5);
 tile!(tile8, 8, 0 1 2 3 4 5 6 7);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What another instruction set would do.
+    #[test]
+    fn the_number_of_sums_at_once_does_not_change_a_bit() {
+        let (rows, k, width) = (37, 23, 7 * LANES);
+        let numbers = |count: usize| (0..count).map(|i| libm::sinf(i as f32)).collect::<Vec<f32>>();
+        let (x, dz) = (numbers(rows * k), numbers(rows * width));
+        let sums = |most: usize| {
+            let mut sums = vec![0.0; k * width];
+            block(Rows::new(&x, k), k, Rows::new(&dz, width), width, &mut sums, rows, most);
+            sums
+        };
+        assert!(sums(1) == sums(4) && sums(2) == sums(4));
+    }
+}

@@ -4,10 +4,11 @@
 //! which sees thousands of rows, gets the same bits as an actor, which sees a few hundred: the first importance ratio
 //! is exactly 1. The general-purpose `gemm` crate gives no such promise.
 //!
-//! A tile of outputs stays in registers: rows are written out by a macro, because the compiler keeps an array of accumulators in
-//! memory when it unrolls a loop over more than sixteen of them too late.
+//! A tile of outputs stays in registers: six rows of four vectors where there are thirty-two registers of sixteen lanes, six rows of
+//! one vector where there are sixteen of eight. Rows are written out by a macro, because the compiler keeps an array of accumulators
+//! in memory when it unrolls a loop over more than sixteen of them too late.
 
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
 /// What is applied to a layer's output.
@@ -60,7 +61,10 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// Weights [k, n] cut into panels of up to four vectors of columns, filled up with zeros.
+/// Vectors of a panel, at most.
+const PANEL: usize = if WIDE { 4 } else { 1 };
+
+/// Weights [k, n] cut into panels of up to [`PANEL`] vectors of columns, filled up with zeros.
 pub(crate) struct Packed {
     panels: Vec<(usize, Vec<f32x16>)>,
     rows: usize,
@@ -70,11 +74,16 @@ pub(crate) struct Packed {
 impl Packed {
     /// From row-major [rows, columns].
     pub(crate) fn new(w: &[f32], rows: usize, columns: usize) -> Self {
+        Self::of(w, rows, columns, PANEL)
+    }
+
+    /// With panels of up to `most` vectors: one, two or four.
+    fn of(w: &[f32], rows: usize, columns: usize, most: usize) -> Self {
         let mut panels = Vec::new();
         let mut start = 0;
         while start < columns {
             let left = (columns - start).div_ceil(LANES);
-            let q = if left >= 4 { 4 } else { left.min(2) };
+            let q = if left >= 4 { 4 } else { left.min(2) }.min(most);
             let mut panel = Vec::with_capacity(rows * q);
             for row in w.chunks_exact(columns) {
                 for v in 0..q {
@@ -200,9 +209,10 @@ fn panel_rows<const Q: usize>(
     finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
 ) {
     let mut row = 0;
-    let high = if Q == 4 { 6 } else { 8 };
+    let six = Q == 4 || !WIDE;
+    let high = if six { 6 } else { 8 };
     while row + high <= rows {
-        if Q == 4 {
+        if six {
             tile6(x, panel, start, y, place, row, finish);
         } else {
             tile8(x, panel, start, y, place, row, finish);
@@ -339,6 +349,19 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// What another instruction set would do.
+    #[test]
+    fn the_width_of_a_panel_does_not_change_a_bit() {
+        let (m, k, n) = (101, 36, 119);
+        let (x, w, b) = (numbers(m * k, 1), numbers(k * n, 2), numbers(n, 3));
+        let product = |most: usize| {
+            let mut y = vec![0.0; m * n];
+            matmul(&x, &Packed::of(&w, k, n, most), Some(&b), Activation::Tanh, &mut y);
+            y
+        };
+        assert!(product(1) == product(4) && product(2) == product(4));
     }
 
     #[test]

@@ -1,5 +1,5 @@
 use super::operation::{Arg, Operation, apply1, apply3};
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, WIDE, load, store};
 use candle_core::{Result, Shape, Tensor, bail};
 use wide::f32x16;
 
@@ -170,11 +170,13 @@ impl PoolWeights {
         }
     }
 
-    /// Calls `f` for the real neighbours of an agent in their order, in groups of four, two and one.
+    /// Calls `f` for the real neighbours of an agent in their order, in groups of four (where there are registers for them), two and
+    /// one.
     #[inline(always)]
     fn neighbours(&self, features: &[f32], count: u8, mut f: impl FnMut(&[f32], Group)) {
         let (mut left, mut features) = (usize::from(count), features);
-        for (size, group) in [(4, Group::Four), (2, Group::Two), (1, Group::One)] {
+        let first = if WIDE { (4, Group::Four) } else { (2, Group::Two) };
+        for (size, group) in [first, (2, Group::Two), (1, Group::One)] {
             while left >= size {
                 f(&features[..size * self.channels], group);
                 features = &features[size * self.channels..];

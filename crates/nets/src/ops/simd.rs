@@ -5,6 +5,10 @@ use wide::{f32x16, i32x16};
 
 pub(crate) const LANES: usize = 16;
 
+/// Whether there are thirty-two registers of sixteen lanes, or sixteen of eight (where one vector takes two of them). Kernels hold
+/// as many sums at once as there is room for; each sum has its own fixed order either way.
+pub(crate) const WIDE: bool = cfg!(target_feature = "avx512f");
+
 /// The first sixteen numbers; a shorter slice is filled up with zeros.
 #[inline(always)]
 pub(crate) fn load(slice: &[f32]) -> f32x16 {
