@@ -12,9 +12,9 @@ pub mod small_disk;
 pub mod wall;
 
 use magex::local::LocalCollector;
-use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::config::{Algorithm, ExecutorKind, MappoConfig, RunConfig};
 use magex_core::ids::RunId;
-use magex_core::task::{Spawn, TaskConfig, TaskName};
+use magex_core::task::{RewardTarget, Spawn, TaskConfig, TaskName};
 use magex_learner::run_events::RunEvent;
 use magex_learner::trainer::{TrainOutcome, Trainer};
 use std::path::Path;
@@ -44,6 +44,20 @@ pub fn small_task(name: TaskName, kind: ExecutorKind, agents: usize, iterations:
     let TaskConfig { horizon, reward_target, .. } = config.task;
     config.task = TaskConfig { horizon, reward_target, ..TaskConfig::of(name, agents, Spawn::Uniform) };
     config.commander.random_assignment_fraction = 0.5;
+    config.validated().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
+}
+
+/// A small run's QMIX or MASER, with a buffer that is full after two iterations and a half.
+pub fn off_policy(algorithm: Algorithm, base: RunConfig) -> RunConfig {
+    let mut config = base;
+    config.run.algorithm = algorithm;
+    config.task.reward_target = RewardTarget::Team;
+    (config.executor.kind, config.executor.recurrent, config.executor.hidden) = (ExecutorKind::Flat, true, 32);
+    config.executor.neighbours = 6;
+    config.mappo = MappoConfig::default();
+    let q = &mut config.qmix;
+    (q.buffer_episodes, q.batch_episodes, q.episodes_per_gradient_step) = (20, 6, 2);
+    (q.target_update_every, q.epsilon_steps, q.gradient_slices) = (10, 400, 3);
     config.validated().unwrap_or_else(|e| panic!("the test's configuration: {e}"))
 }
 

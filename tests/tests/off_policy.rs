@@ -1,30 +1,16 @@
 //! QMIX and MASER: trained by the same service, with the same promises as MAPPO.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use magex_core::config::{Algorithm, ExecutorKind, MappoConfig, RunConfig};
+use magex_core::config::{Algorithm, ExecutorKind, RunConfig};
 use magex_core::ids::RunId;
 use magex_core::task::{RewardTarget, Spawn, TaskConfig, TaskName};
 use magex_learner::trainer::{TrainOutcome, Trainer};
 use magex_tests::sandbox::{Cluster, wait_until};
-use magex_tests::{drive, small, train, updates};
+use magex_tests::{drive, off_policy, small, train, updates};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-
-/// Small, and with a buffer that is full after two iterations and a half.
-fn off_policy(algorithm: Algorithm, base: RunConfig) -> RunConfig {
-    let mut config = base;
-    config.run.algorithm = algorithm;
-    config.task.reward_target = RewardTarget::Team;
-    (config.executor.kind, config.executor.recurrent, config.executor.hidden) = (ExecutorKind::Flat, true, 32);
-    config.executor.neighbours = 6;
-    config.mappo = MappoConfig::default();
-    let q = &mut config.qmix;
-    (q.buffer_episodes, q.batch_episodes, q.episodes_per_gradient_step) = (20, 6, 2);
-    (q.target_update_every, q.epsilon_steps, q.gradient_slices) = (10, 400, 3);
-    config.validated().unwrap()
-}
 
 fn config(algorithm: Algorithm, iterations: u64) -> RunConfig {
     off_policy(algorithm, small(ExecutorKind::Local, 4, iterations))

@@ -5,13 +5,13 @@
 use magex_actor::goal_client::GrpcGoals;
 use magex_actor::run::{ActorConfig, ActorError, ActorReport};
 use magex_actor::worker::{MakeWorker, PolicyWorker, WorkError, Worker};
-use magex_core::config::{ExecutorKind, RunConfig};
+use magex_core::config::{Algorithm, ExecutorKind, RunConfig};
 use magex_core::ids::{Shard, ShardKind};
 use magex_core::metrics_table::SUCCESS_RATE;
 use magex_core::trajectory::{ShardResult, Trajectory};
 use magex_proto::weights::Weights;
 use magex_tests::sandbox::{Cluster, Setup, wait_until};
-use magex_tests::{small, train};
+use magex_tests::{off_policy, small, train};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -147,6 +147,16 @@ fn log_probabilities_that_the_weights_do_not_give_are_kept_in_quarantine() {
     assert!(about["reason"].as_str().unwrap().starts_with("goal_log_probs: differs"), "{about}");
     cluster.start_actor();
     assert_eq!(cluster.finish(), undisturbed(&config));
+}
+
+/// What a learner with a replay buffer recomputes: the best actions by its values, and the draws of each episode's stream.
+#[test]
+fn actions_that_the_values_do_not_give_are_refused_without_log_probabilities_too() {
+    let config = off_policy(Algorithm::Qmix, small(ExecutorKind::Local, 4, 3));
+    let all = trajectory(|t| t.actions.iter_mut().for_each(|action| *action = 4 - *action));
+    survives(&config, "other actions", all, "actions: differs by", "0");
+    let one = trajectory(|t| *t.actions.last_mut().unwrap() = (t.actions.last().unwrap() + 1) % 5);
+    survives(&config, "one other action", one, "actions: differs by", "0");
 }
 
 /// One unit in the last place of one reward, from some result on.

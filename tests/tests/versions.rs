@@ -142,9 +142,14 @@ async fn commander(program: &Path, folder: &Path) -> (Process, Channel) {
 async fn what_clients_send_is_answered_as_before_or_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let (_commander, channel) = commander(binary(), folder.path()).await;
+    let mut mission_is_there = true;
     for (name, method, told) in CALLS {
         let message = fs::read(golden().join("calls").join(name)).unwrap();
-        let expected = fs::read_to_string(golden().join("calls").join(format!("{name}.txt"))).unwrap();
+        let mut expected = fs::read_to_string(golden().join("calls").join(format!("{name}.txt"))).unwrap();
+        // What was refused is in no list.
+        if name == "7-list" && !mission_is_there {
+            expected.clear();
+        }
         match call(&channel, method, message.into()).await {
             Ok(answer) => assert_eq!(told(answer), expected, "{name}"),
             // Later calls may be about a mission that was not made.
@@ -152,6 +157,7 @@ async fn what_clients_send_is_answered_as_before_or_refused_by_name() {
                 let named = [Code::InvalidArgument, Code::FailedPrecondition, Code::NotFound, Code::Unimplemented];
                 assert!(named.contains(&status.code()) && !status.message().is_empty(), "{name}: {status:?}");
                 println!("{name} is refused: {}", status.message());
+                mission_is_there &= name != "4-create";
             }
         }
     }

@@ -152,12 +152,12 @@ impl Solver {
         let mut tolerance = ties::tolerance(rows, magnitude(row_price), magnitude(&price[..cols]));
         loop {
             near.clear();
-            let mut beaten = 0.0;
+            let mut beaten = [0.0; LANES];
             for (costs, &own) in cost.chunks_exact(*stride).zip(row_price.iter()) {
-                let least = nearly_tight(costs, price, own + tolerance, &mut near.cols);
-                beaten += higher(own - least, 0.0);
+                nearly_tight(costs, price, own, tolerance, &mut beaten, &mut near.cols);
                 near.end_row();
             }
+            let beaten = rows as f64 * beaten.into_iter().fold(0.0, higher);
             // A repricing that rounds leaves pairs that look better than tight.
             if beaten <= 0.25 * tolerance {
                 break;
@@ -350,28 +350,35 @@ impl Solver {
     }
 }
 
-/// Appends the columns whose cost − price is up to `limit`, ascending, and returns the least.
-fn nearly_tight(costs: &[f64], price: &[f64], limit: f64, near: &mut Vec<u32>) -> f64 {
-    let mut least = [f64::INFINITY; LANES];
+/// Appends the columns whose cost − price is up to `own` + `tolerance`, ascending, and raises `beaten` to what others are
+/// below `own`.
+fn nearly_tight(
+    costs: &[f64],
+    price: &[f64],
+    own: f64,
+    tolerance: f64,
+    beaten: &mut [f64; LANES],
+    near: &mut Vec<u32>,
+) {
+    let limit = own + tolerance;
     let chunks = costs.as_chunks::<LANES>().0.iter().zip(price.as_chunks::<LANES>().0);
     for (chunk, (costs, price)) in chunks.enumerate() {
-        let mut hits = 0u8;
+        let (mut reduced, mut hit) = ([0.0; LANES], [false; LANES]);
         for lane in 0..LANES {
-            let reduced = costs[lane] - price[lane];
-            least[lane] = lower(reduced, least[lane]);
-            hits |= u8::from(reduced <= limit) << lane;
+            reduced[lane] = costs[lane] - price[lane];
+            beaten[lane] = higher(own - reduced[lane], beaten[lane]);
+            hit[lane] = reduced[lane] <= limit;
         }
-        let first = (chunk * LANES) as u32;
-        if hits == u8::MAX {
-            near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
-        } else {
-            while hits != 0 {
-                near.push(first + hits.trailing_zeros());
-                hits &= hits - 1;
+        // Few chunks have one; a branch per entry would take longer than all of the above.
+        if hit.iter().fold(false, |any, &hit| any | hit) {
+            let first = (chunk * LANES) as u32;
+            if hit.iter().fold(true, |all, &hit| all & hit) {
+                near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
+            } else {
+                near.extend((0u32..).zip(hit).filter(|(_, hit)| *hit).map(|(lane, _)| first + lane));
             }
         }
     }
-    least.into_iter().fold(f64::INFINITY, lower)
 }
 
 /// The two smallest cost − price of a row, equal if the smallest occurs twice.

@@ -102,7 +102,7 @@ def contests(args):
                 "jax_ppo.py", speed, "--policy", "mappo-gru", "--agents", a, "--hidden", 128, "--iterations", i
             ),
             "ours": lambda a=agents, s=shape, b=2000 * (slow + 1): ours_train(
-                args.magex, CONFIGS / "baselines/mappo-gru.toml", a, flat + s, b
+                args.magex, CONFIGS / "baselines/mappo-rnn.toml", a, flat + s, b
             ),
         }
         shape = ["task.horizon=30", "collect.episodes_per_iteration=32", "mappo.chunk_length=10", "mappo.epochs=10"]
@@ -110,7 +110,7 @@ def contests(args):
         yield "mappo-torch", agents, {
             "PyTorch": lambda a=agents: theirs("torch_mappo.py", speed, "--agents", a, "--iterations", 3 if a < 20 else 1),
             "ours": lambda a=agents, s=shape, b=960 * (iterations + 1): ours_train(
-                args.magex, CONFIGS / "baselines/mappo-gru.toml", a, flat[:2] + s, b
+                args.magex, CONFIGS / "baselines/mappo-rnn.toml", a, flat[:2] + s, b
             ),
         }
         yield "env", agents, {

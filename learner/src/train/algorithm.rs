@@ -62,7 +62,10 @@ impl Algorithm {
                     other => other,
                 })
             }
-            Self::Qmix(qmix) => Ok(qmix.update(learned, trajectories, iteration)?),
+            Self::Qmix(qmix) => {
+                qmix.check_actions(learned, trajectories)?;
+                Ok(qmix.update(learned, trajectories, iteration)?)
+            }
         }
     }
 }

@@ -17,6 +17,8 @@
 //!
 //! MASER adds its intrinsic reward to the reward and its losses to the loss: [`maser`].
 
+mod actions;
+
 use crate::train::batch::{column, plain, sum_of_rows};
 use crate::train::learned::{Learned, Moments, Network};
 use crate::train::mappo::{part, sum, sum_in_order};

@@ -5,10 +5,14 @@ use super::candidates::{Candidates, Engine};
 use crate::AssignError;
 
 /// Bids per row and stage, at most: what is left then is the shortest paths' work.
-const BIDS: usize = 8;
+const BIDS: usize = 40;
 /// ε falls by this from stage to stage.
 const FALL: f64 = 0.2;
-const STAGES: usize = 7;
+/// Stages from [`NEAR`] mean differences between the cheapest and the second cheapest column on; before them, as many as lead
+/// there from the largest cost / [`FAR`], the scale on which clusters compete.
+const STAGES: usize = 8;
+const NEAR: f64 = 30.0;
+const FAR: f64 = 16.0;
 
 impl<C: Candidates> Engine<C> {
     /// Gives most rows a column that is one of their cheapest. With as many rows as columns, stages of falling ε; otherwise a
@@ -18,7 +22,11 @@ impl<C: Candidates> Engine<C> {
         let mut free: Vec<u32> = (0..rows as u32).collect();
         if rows == self.row_of_col.len() && rows > 1 {
             let mut epsilon = self.first_epsilon();
-            for _ in 0..STAGES {
+            let mut stages = STAGES;
+            while epsilon * FAR < self.source.largest_cost() && stages < 2 * STAGES {
+                (epsilon, stages) = (epsilon / FALL, stages + 1);
+            }
+            for _ in 0..stages {
                 self.bid(&mut free, epsilon, BIDS * rows, should_continue)?;
                 epsilon *= FALL;
                 self.free_unless_best(&mut free, epsilon);
@@ -28,7 +36,7 @@ impl<C: Candidates> Engine<C> {
         self.bid(&mut free, 0.0, 4 * rows, should_continue)
     }
 
-    /// The mean difference between the cheapest and the second cheapest column.
+    /// ε of the last [`STAGES`] stages' first one.
     fn first_epsilon(&mut self) -> f64 {
         let rows = self.col_of_row.len();
         let mut sum = 0.0;
@@ -37,7 +45,8 @@ impl<C: Candidates> Engine<C> {
             // A row may have only one column.
             sum += if best.second < f64::INFINITY { best.second - best.least } else { 0.0 };
         }
-        4.0 * sum / rows as f64
+        // Where many are the same, the differences say nothing.
+        (NEAR * sum / rows as f64).max(1e-4 * self.source.largest_cost())
     }
 
     /// Frees the rows whose column is not within ε of their cheapest.

@@ -10,6 +10,8 @@ pub(super) const COUNT: usize = 16;
 pub(super) trait Candidates {
     fn rows(&self) -> usize;
     fn cols(&self) -> usize;
+    /// No pair costs more.
+    fn largest_cost(&self) -> f64;
     /// What a row without a column costs, if that may be.
     fn sink(&self) -> Option<f64>;
     /// Replaces `found` by at least the `count` columns of a row with the least cost − price; returns what no other column is

@@ -21,6 +21,17 @@ impl Metric {
         if cost <= self.limit { cost } else { f64::INFINITY }
     }
 
+    /// The costs of pairs with these squared distances.
+    #[inline(always)]
+    pub(super) fn costs<const L: usize>(&self, squares: &mut [f64; L]) {
+        if self.power == 1.0 {
+            squares.iter_mut().for_each(|square| *square = square.sqrt());
+        } else if self.power != 2.0 {
+            squares.iter_mut().for_each(|square| *square = powered_square(*square, self.power));
+        }
+        squares.iter_mut().for_each(|cost| *cost = if *cost <= self.limit { *cost } else { f64::INFINITY });
+    }
+
     /// No point that is at least as far along every axis costs less.
     #[inline]
     pub(super) fn at_least<const D: usize>(&self, apart: &[f64; D]) -> f64 {

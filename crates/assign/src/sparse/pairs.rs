@@ -136,6 +136,10 @@ impl Candidates for &List {
         self.cols
     }
 
+    fn largest_cost(&self) -> f64 {
+        self.sink
+    }
+
     fn sink(&self) -> Option<f64> {
         Some(self.sink)
     }

@@ -130,7 +130,8 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
     let metric = Metric { power: problem.power, limit: limit.cost };
     let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
     let own = own_costs(problem, &agents, &goals, metric);
-    let sink = sink(&own, &agents, &goals, metric)?.filter(|_| !limit.complete);
+    let (largest_cost, sink) = largest_costs(&own, &agents, &goals, metric)?;
+    let sink = sink.filter(|_| !limit.complete);
     let (short, long) = if turned { (&goals, &agents) } else { (&agents, &goals) };
     // Neighbours in space become neighbours in memory.
     let (tree, col_at) = Tree::new(long);
@@ -142,6 +143,7 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
         own: own.places(&row_at, &place_of_col),
         tree,
         metric,
+        largest_cost,
         sink,
     };
     let exact = PointCosts { from: short, to: long, metric, own: &own, sink: sink.unwrap_or(0.0), turned };
@@ -188,13 +190,13 @@ pub(super) fn own_costs<T, const D: usize>(
     OwnCosts::new(pairs, goals.len())
 }
 
-/// What a row without a column costs, above all that other pairs could save; none if no pair is forbidden.
-fn sink<const D: usize>(
+/// What no pair exceeds, and what a row without a column costs, above all that other pairs could save, if a pair is forbidden.
+fn largest_costs<const D: usize>(
     own: &OwnCosts,
     agents: &[[f64; D]],
     goals: &[[f64; D]],
     metric: Metric,
-) -> Result<Option<f64>, AssignError> {
+) -> Result<(f64, Option<f64>), AssignError> {
     let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
     for point in agents.iter().chain(goals) {
         for axis in 0..D {
@@ -207,15 +209,13 @@ fn sink<const D: usize>(
         return Err(AssignError::invalid("power", problem));
     }
     let forbidden = own.pairs.iter().filter(|pair| pair.terms[0] == f64::INFINITY).count();
-    if forbidden == 0 && metric.limit == f64::INFINITY {
-        return Ok(None);
-    }
     let mut span = Span { forbidden, least: 0.0, largest: diagonal.min(metric.limit) };
     for pair in own.pairs.iter().filter(|pair| pair.terms[0] < f64::INFINITY) {
         span.least = span.least.min(pair.cost());
         span.largest = span.largest.max(pair.terms[0]);
     }
-    Ok(Some(span.penalty(agents.len().min(goals.len()))))
+    let any = forbidden > 0 || metric.limit < f64::INFINITY;
+    Ok((span.largest, any.then(|| span.penalty(agents.len().min(goals.len())))))
 }
 
 /// The solver's rows and columns, in the order of their trees.
@@ -224,6 +224,7 @@ struct Points<const D: usize> {
     tree: Tree<D>,
     metric: Metric,
     own: OwnCosts,
+    largest_cost: f64,
     sink: Option<f64>,
 }
 
@@ -234,6 +235,10 @@ impl<const D: usize> Candidates for Points<D> {
 
     fn cols(&self) -> usize {
         self.tree.points().len()
+    }
+
+    fn largest_cost(&self) -> f64 {
+        self.largest_cost
     }
 
     fn sink(&self) -> Option<f64> {

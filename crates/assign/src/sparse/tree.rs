@@ -6,8 +6,8 @@
 
 use super::costs::Metric;
 
-/// Points of a leaf, at most.
-const LEAF: usize = 8;
+/// Points of a leaf, at most: all are looked at together, in vectors.
+const LEAF: usize = 16;
 
 #[derive(Debug, Clone)]
 struct Node<const D: usize> {
@@ -18,6 +18,8 @@ struct Node<const D: usize> {
     end: u32,
     /// The second child; the first one follows its parent. 0 for a leaf.
     second: u32,
+    /// Of a leaf, where its coordinates are.
+    block: u32,
     largest_price: f64,
 }
 
@@ -27,6 +29,8 @@ pub(super) struct Tree<const D: usize> {
     nodes: Vec<Node<D>>,
     /// `[points]` in the tree's order.
     points: Vec<[f64; D]>,
+    /// The same of every leaf by axis; where it has fewer points, the others are infinitely far away.
+    blocks: Vec<[[f64; LEAF]; D]>,
     /// `[points]` points that are passed over, and `[nodes]` points below each node that are not.
     closed: Vec<bool>,
     open: Vec<u32>,
@@ -38,9 +42,26 @@ impl<const D: usize> Tree<D> {
     pub(super) fn new(points: &[[f64; D]]) -> (Self, Vec<u32>) {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
         let (nodes, open) = (Vec::new(), Vec::new());
-        let mut tree = Self { nodes, points: Vec::new(), closed: vec![false; points.len()], open, stack: Vec::new() };
+        let mut tree = Self {
+            blocks: Vec::new(),
+            nodes,
+            points: Vec::new(),
+            closed: vec![false; points.len()],
+            open,
+            stack: Vec::new(),
+        };
         tree.split(points, &mut order, 0);
         tree.points = order.iter().map(|&point| points[point as usize]).collect();
+        for node in tree.nodes.iter_mut().filter(|node| node.second == 0) {
+            let mut block = [[f64::INFINITY; LEAF]; D];
+            for (lane, point) in tree.points[node.start as usize..node.end as usize].iter().enumerate() {
+                for axis in 0..D {
+                    block[axis][lane] = point[axis];
+                }
+            }
+            node.block = tree.blocks.len() as u32;
+            tree.blocks.push(block);
+        }
         tree.open = tree.nodes.iter().map(|node| node.end - node.start).collect();
         (tree, order)
     }
@@ -54,7 +75,7 @@ impl<const D: usize> Tree<D> {
         }
         let place = self.nodes.len();
         let end = start + order.len() as u32;
-        self.nodes.push(Node { low, high, start, end, second: 0, largest_price: 0.0 });
+        self.nodes.push(Node { low, high, start, end, second: 0, block: 0, largest_price: 0.0 });
         if order.len() <= LEAF {
             return;
         }
@@ -169,13 +190,10 @@ impl<const D: usize> Tree<D> {
                 }
                 continue;
             }
-            for col in start..end {
-                if only_open && self.closed[col as usize] {
-                    continue;
-                }
-                let cost = metric.cost(from, &self.points[col as usize]);
-                let reduced = cost - price[col as usize];
-                if reduced >= limit {
+            let (costs, reduced) = self.leaf(place, from, metric, price);
+            for lane in 0..(end - start) as usize {
+                let (cost, reduced, col) = (costs[lane], reduced[lane], start + lane as u32);
+                if reduced >= limit || (only_open && self.closed[col as usize]) {
                     continue;
                 }
                 let mut at = found.len();
@@ -193,6 +211,31 @@ impl<const D: usize> Tree<D> {
         }
         self.stack = stack;
         limit
+    }
+
+    /// Costs of the points of a leaf, and these less their prices.
+    #[inline(always)]
+    fn leaf(&self, place: u32, from: &[f64; D], metric: &Metric, price: &[f64]) -> ([f64; LEAF], [f64; LEAF]) {
+        let &Node { start, end, block, .. } = &self.nodes[place as usize];
+        let block = &self.blocks[block as usize];
+        let mut costs = [0.0; LEAF];
+        for axis in 0..D {
+            for lane in 0..LEAF {
+                let difference = from[axis] - block[axis][lane];
+                costs[lane] += difference * difference;
+            }
+        }
+        metric.costs(&mut costs);
+        let mut reduced = [f64::INFINITY; LEAF];
+        // Beyond the leaf's points the costs are infinite, whatever the price.
+        match price[start as usize..].first_chunk::<LEAF>() {
+            Some(price) => (0..LEAF).for_each(|lane| reduced[lane] = costs[lane] - price[lane]),
+            None => {
+                let price = &price[start as usize..end as usize];
+                (0..price.len()).for_each(|lane| reduced[lane] = costs[lane] - price[lane]);
+            }
+        }
+        (costs, reduced)
     }
 
     /// The cheapest open place that costs up to `limit` and is not to be skipped, and its cost.
