@@ -5,7 +5,7 @@ use super::matmul::Rows;
 use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
-/// Rows that pass over a tile of sums while it is in registers: x and dz of so many stay in the first cache level.
+/// Rows that pass over a tile of sums while it is in registers, few enough for x and dz to stay in the first cache level.
 const BLOCK: usize = 64;
 
 /// Vectors of a row of sums that are in registers at once, at most.
