@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 #![allow(clippy::disallowed_methods, reason = "candle's own functions are what ours are compared with")]
 
+mod chain;
 mod support;
 
 use candle_core::{DType, Device, Tensor, Var};

@@ -1,15 +1,11 @@
 //! A chain of layers as one operation against its layers one by one.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
-#![allow(clippy::disallowed_methods, reason = "candle's own functions are what ours are compared with")]
 
-mod support;
-
+use crate::support::{check, normal, probe, var};
 use candle_core::{Tensor, Var};
 use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, Field};
 use magex_nets::params::ParamBuilder;
 use std::sync::Arc;
-use support::{check, normal, probe, var};
 
 /// The rows of a chain's parameters, in the order of its builder.
 fn cut(parameters: &Tensor, sizes: &[&[usize]]) -> Vec<Tensor> {
