@@ -159,9 +159,10 @@ fn anywhere(mappo: &Mappo, learned: &Learned, episodes: u32) -> Batch {
 #[test]
 fn threads_do_not_reach_a_number_and_the_first_ratio_is_exactly_one() {
     use magex_core::config::ExecutorKind::{Flat, Local, Magex};
-    use magex_core::task::{Spawn, TaskConfig};
+    use magex_core::task::{RewardTarget, Spawn, TaskConfig};
     for (kind, recurrent) in [(Local, false), (Magex, false), (Flat, false), (Flat, true)] {
-        let task = TaskConfig { horizon: 20, ..TaskConfig::simple_spread(7, Spawn::Uniform) };
+        let reward_target = if kind == Flat { RewardTarget::Team } else { RewardTarget::Goals };
+        let task = TaskConfig { horizon: 20, reward_target, ..TaskConfig::simple_spread(7, Spawn::Uniform) };
         let mut config = RunConfig { task, ..RunConfig::default() };
         (config.executor.kind, config.executor.recurrent) = (kind, recurrent);
         (config.mappo.minibatch_size, config.mappo.chunk_length) = (280, 5);
