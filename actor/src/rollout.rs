@@ -21,6 +21,7 @@ use magex_nets::executor::{Act, Model};
 use magex_nets::features::Symmetry;
 use magex_nets::params::ParamError;
 use magex_proto::goals::{GoalReply, GoalRequest};
+use std::sync::Arc;
 
 /// Why a shard could not be rolled out. E is the error of the commander's client.
 #[derive(Debug, thiserror::Error)]
@@ -157,12 +158,12 @@ impl Roller {
             let mut symmetries: Vec<Symmetry> = Vec::new();
             match &mut driver {
                 Driver::Policy(policy, carried) => {
-                    let features = self.model.spec().compute(&state.joint_state());
+                    let features = Arc::new(self.model.spec().compute(&state.joint_state()));
                     carried.act(*policy, &features, step, &mut chosen).map_err(ParamError::from)?;
                     if let Some(place) = chosen.not_finite {
                         return Err(RolloutError::NotFinite { place, step, version: shard.version.0 });
                     }
-                    symmetries = features.symmetries;
+                    symmetries.clone_from(&features.symmetries);
                 }
                 Driver::Controller(controller) => controller.act(&state.joint_state(), &mut chosen.actions)?,
             }

@@ -22,8 +22,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Format of the folder; readers reject any other.
-pub const FORMAT: u32 = 2;
-const FIRST_FORMAT: u32 = 1;
+pub const FORMAT: u32 = 3;
 
 /// Why a checkpoint could not be written or read.
 #[derive(Debug, thiserror::Error)]
@@ -76,7 +75,9 @@ fn in_file<R: ToString>(path: &Path) -> impl FnOnce(R) -> CheckpointError + use<
 
 fn writer(format: u32) -> &'static str {
     match format {
-        FIRST_FORMAT => "magex 0.1.0 (commit 389f705)",
+        1 => "magex 0.1.0 (commit 389f705)",
+        // The same files; what is computed on from them has other bits.
+        2 => "magex 0.2.0 (commit 335875b or before)",
         _ => "another release of magex",
     }
 }
@@ -361,10 +362,15 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
 /// may have other keys.
 pub fn check_format(run: &Path) -> Result<(), CheckpointError> {
     let Some(path) = list(run).pop() else { return Ok(()) };
-    let manifest = fs::read(path.join(MANIFEST)).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    match manifest {
-        Some(Format { format: FIRST_FORMAT }) => Err(CheckpointError::Format { path, format: FIRST_FORMAT }),
-        // Any other number may be a flipped bit: `read` tells damage from another format.
+    let format = |file: &str| {
+        let Format { format } = serde_json::from_slice(&fs::read(path.join(file)).ok()?).ok()?;
+        Some(format)
+    };
+    match (format(MANIFEST), format("state.json")) {
+        // One file alone may have a flipped bit: `read` tells damage from another format.
+        (Some(format), Some(same)) if format == same && format != FORMAT => {
+            Err(CheckpointError::Format { path, format })
+        }
         _ => Ok(()),
     }
 }

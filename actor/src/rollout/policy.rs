@@ -78,7 +78,7 @@ impl Carried {
     pub(super) fn act(
         &mut self,
         policy: &dyn Act,
-        features: &Features,
+        features: &Arc<Features>,
         step: usize,
         choose: &mut dyn Chooser,
     ) -> candle_core::Result<()> {

@@ -13,8 +13,11 @@ use magex_learner::train::batch::Batch;
 use magex_learner::train::learned::Learned;
 use magex_learner::train::mappo::Mappo;
 use magex_learner::trainer::TrainError;
+use magex_nets::params::Entry;
 use serde_json::json;
+use std::hint::black_box;
 use std::time::Instant;
+use wide::f32x16;
 
 /// Agent samples of the minibatch that is timed.
 const MINIBATCH: usize = 4096;
@@ -29,30 +32,90 @@ pub(crate) struct UpdateArgs {
 
 pub(crate) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
     let title = "One PPO minibatch, one core: actor and critic, forward, loss, backward, Adam";
-    let heading = ["executor", "N", "samples", "ms", "ms with values and advantages"];
+    let heading = ["executor", "N", "samples", "ms", "ms with values and advantages", "least ms", "GFLOP/s", "of peak"];
     let mut report = Report::new("update", title, 1, &heading);
-    for (kind, agents) in [
-        (ExecutorKind::Local, 64),
-        (ExecutorKind::Magex, 50),
-        (ExecutorKind::MagexLiteral, 50),
-        (ExecutorKind::Attention, 50),
-        (ExecutorKind::Mlp, 50),
+    let mut peak = peak();
+    for (kind, recurrent, agents) in [
+        (ExecutorKind::Local, false, 64),
+        (ExecutorKind::Magex, false, 50),
+        (ExecutorKind::MagexLiteral, false, 50),
+        (ExecutorKind::Attention, false, 50),
+        (ExecutorKind::Mlp, false, 50),
+        (ExecutorKind::Flat, false, 20),
+        (ExecutorKind::Flat, true, 20),
     ] {
         let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
         config.executor.kind = kind;
+        config.executor.recurrent = recurrent;
         config.mappo.minibatch_size = MINIBATCH;
         let rounds = if kind == ExecutorKind::Local { args.rounds } else { args.rounds.div_ceil(3) };
         let time = minibatch(&config, 8, rounds as usize)?;
-        let cells = vec![
-            kind.to_string(),
+        peak = peak.max(self::peak());
+        let name = if recurrent { format!("{kind}, GRU") } else { kind.to_string() };
+        let mut cells = vec![
+            name,
             agents.to_string(),
             time.samples.to_string(),
             format!("{:.2}", time.gradient_ms),
             format!("{:.2}", time.update_ms),
+            format!("{:.2}", time.least_ms),
         ];
-        report.row(cells, json!({ "executor": kind, "agents": agents, "time": time }));
+        let rate = time.flops.map(|flops| flops / time.least_ms / 1e6);
+        cells.push(rate.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.1}")));
+        cells.push(rate.map_or_else(|| "-".to_owned(), |rate| format!("{:.2}", rate * 1e9 / peak)));
+        let value = json!({ "executor": kind, "recurrent": recurrent, "agents": agents, "time": time, "peak": peak });
+        report.row(cells, value);
     }
+    report.notes.push(format!(
+        "peak of one core: {:.1} GFLOP/s (fused multiply-adds in registers, measured between the rows); \
+         floating-point operations are those of the products, forward and both gradients, real rows only",
+        peak / 1e9
+    ));
     Ok(report)
+}
+
+/// Floating-point operations per second of sixteen independent chains of fused multiply-adds that touch no memory: the most that
+/// any kernel here could reach. The best of a few short runs.
+fn peak() -> f64 {
+    const CHAINS: usize = 16;
+    const STEPS: usize = 20_000;
+    let (factor, term) = (f32x16::splat(black_box(0.999)), f32x16::splat(black_box(0.001)));
+    let run = |_| {
+        let mut sums = [f32x16::splat(black_box(1.0)); CHAINS];
+        let clock = Instant::now();
+        for _ in 0..STEPS {
+            for sum in &mut sums {
+                *sum = factor.mul_add(*sum, term);
+            }
+        }
+        let seconds = clock.elapsed().as_secs_f64();
+        black_box(sums);
+        (CHAINS * STEPS * 2 * 16) as f64 / seconds
+    };
+    (0..20).map(run).fold(0.0, f64::max)
+}
+
+/// Floating-point operations of the products of one agent sample: forward, gradient of the weights and, where something is learned
+/// before a layer, of its input. `None` for executors with products that are not layers.
+fn flops(config: &RunConfig, mappo: &Mappo, neighbours: f64) -> Result<Option<f64>, TrainError> {
+    let n = config.task.agents as f64;
+    if !matches!(config.executor.kind, ExecutorKind::Local | ExecutorKind::Magex | ExecutorKind::Flat) {
+        return Ok(None);
+    }
+    let networks = mappo.init()?;
+    let layer = |entry: &Entry| match (entry.name.as_str(), &entry.shape[..]) {
+        // Features are constant.
+        ("own.weight" | "f_o.weight" | "f_goal.weight", [k, n]) => 4.0 * (k * n) as f64,
+        (name, [k, n]) if name.ends_with(".relative") => 4.0 * (k * n) as f64,
+        ("neighbour.weight", [k, n]) => 4.0 * neighbours * (k * n) as f64,
+        // Once per joint state.
+        ("team.weight", [k, m]) => 4.0 / n * (k * m) as f64,
+        // Once per pair.
+        (name, [p]) if name.ends_with(".score") => 6.0 * (n - 1.0) * (p - 1) as f64,
+        (_, [k, n]) => 6.0 * (k * n) as f64,
+        _ => 0.0,
+    };
+    Ok(Some(networks.iter().flat_map(|network| &network.params.entries).map(layer).sum()))
 }
 
 /// What a minibatch takes on one thread, medians in milliseconds.
@@ -66,6 +129,10 @@ struct MinibatchTime {
     update_ms: f64,
     /// One more epoch, per minibatch: actor and critic forward, loss, backward, clipping, Adam.
     gradient_ms: f64,
+    /// The same from the fastest rounds instead of the medians: what others on the machine leave alone.
+    least_ms: f64,
+    /// Floating-point operations of the minibatch's products.
+    flops: Option<f64>,
 }
 
 /// Times updates on a synthetic batch of exactly `minibatches` minibatches of the configured size (rounded down to whole
@@ -85,6 +152,7 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
     let pool = pool.map_err(|error| TrainError::Threads(error.to_string()))?;
     pool.install(|| {
         let mut time = [Vec::new(), Vec::new()];
+        let mut per_sample = None;
         for round in 0..=rounds {
             for (epochs, times) in (1u32..).zip(&mut time) {
                 config.mappo.epochs = epochs;
@@ -93,6 +161,9 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
                 let mut batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
                 // The update refuses those of another policy.
                 batch.log_probs = mappo.log_probs(&learned, &batch)?;
+                let counts = batch.features.iter().flat_map(|features| &features.counts);
+                let (sum, rows) = counts.fold((0.0, 0.0), |(sum, rows), &count| (sum + f64::from(count), rows + 1.0));
+                per_sample = flops(&config, &mappo, sum / f64::max(rows, 1.0))?;
                 let clock = Instant::now();
                 mappo.update(&mut learned, &batch, 0, 0.0)?;
                 // The first round warms the caches.
@@ -101,9 +172,13 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
                 }
             }
         }
+        let samples = units * chunk * n;
+        let least = time.each_ref().map(|times| times.iter().copied().fold(f64::INFINITY, f64::min));
         let [one, two] = time.map(|mut times| quantile(&mut times, 0.5));
         Ok(MinibatchTime {
-            samples: units * chunk * n,
+            samples,
+            least_ms: (least[1] - least[0]) / minibatches as f64,
+            flops: per_sample.map(|flops| flops * samples as f64),
             minibatches,
             update_ms: one / minibatches as f64,
             gradient_ms: (two - one) / minibatches as f64,

@@ -1,7 +1,7 @@
 //! Categorical action distributions, evaluated row by row. Actors (to act) and learner (to differentiate) share this
 //! code, so equal logits give equal log-probabilities to the bit.
 
-use crate::ops::{LANES, load};
+use crate::ops::{LANES, exp_of_negative};
 use magex_core::rng::Stream;
 use wide::f32x16;
 
@@ -133,17 +133,27 @@ impl ActionHeads {
     }
 }
 
-/// x − max − ln Σ exp(x − max) for up to sixteen numbers.
+/// x − max − ln Σ exp(x − max) for up to sixteen numbers: those of sixteen rows that are alike.
 #[inline]
 fn log_softmax(logits: &[f32], out: &mut [f32]) {
-    let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    let shifted = load(logits) - f32x16::splat(max);
-    let exps = shifted.exp().to_array();
-    let sum: f32 = exps[..logits.len()].iter().sum();
-    let log_sum = libm::logf(sum);
-    for (o, x) in out.iter_mut().zip(logits) {
-        *o = (x - max) - log_sum;
+    let mut columns = [f32x16::ZERO; LANES];
+    let columns = &mut columns[..logits.len()];
+    columns.iter_mut().zip(logits).for_each(|(column, x)| *column = f32x16::splat(*x));
+    log_softmax_of_rows(columns);
+    out.iter_mut().zip(columns).for_each(|(out, column)| *out = column.to_array()[0]);
+}
+
+/// The same for sixteen rows at once, one vector for each choice; in place.
+#[inline(always)]
+pub(crate) fn log_softmax_of_rows(columns: &mut [f32x16]) {
+    let max = columns.iter().fold(f32x16::splat(f32::NEG_INFINITY), |max, x| max.fast_max(*x));
+    let mut sum = f32x16::ZERO;
+    for x in columns.iter_mut() {
+        *x -= max;
+        sum += exp_of_negative(*x);
     }
+    let log_sum = sum.ln();
+    columns.iter_mut().for_each(|x| *x -= log_sum);
 }
 
 #[cfg(test)]

@@ -32,15 +32,16 @@ mod q_network;
 mod team;
 
 use crate::features::{FeatureSpec, Features, FlatSpec};
-use crate::ops::{Activation, GraphNoise, linear, neighbour_pool};
+use crate::ops::{Activation, GraphNoise, linear};
 use crate::params::{Init, ParamBuilder, ParamError};
-use candle_core::{Device, Result as CandleResult, Tensor};
+use candle_core::{Result as CandleResult, Tensor};
 use candle_nn::Module;
 use dicg::DicgNet;
 use flat::FlatNet;
 use local::LocalNet;
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::task::TaskConfig;
+use std::sync::Arc;
 use team::TeamNet;
 
 pub use mixer::{Distance, Mixer};
@@ -58,7 +59,7 @@ pub struct Input<'a> {
     /// N: agents.
     pub agents: usize,
     /// Features of the L·C·N rows.
-    pub features: &'a Features,
+    pub features: &'a Arc<Features>,
     /// [C·N, H] state of the memory that enters the first step; empty for networks without memory.
     pub hidden: Vec<f32>,
     /// Gumbel noise: one key per joint state, L·C of them.
@@ -164,29 +165,6 @@ impl Layer {
 impl Module for Layer {
     fn forward(&self, x: &Tensor) -> CandleResult<Tensor> {
         linear(x, &self.w, &self.b, self.act, self.constant_input)
-    }
-}
-
-/// Σ over an agent's nearest neighbours of relu(neighbour → units).
-struct NeighbourEncoder {
-    w: Tensor,
-    b: Tensor,
-    neighbours: usize,
-    width: usize,
-}
-
-impl NeighbourEncoder {
-    fn build(params: &mut ParamBuilder, name: &str, spec: &FeatureSpec, units: usize) -> Result<Self, ParamError> {
-        let (neighbours, width) = (spec.neighbours, spec.neighbour_width());
-        let w = params.tensor(&format!("{name}.weight"), &[width, units], Init::Orthogonal(RELU_GAIN))?;
-        let b = params.tensor(&format!("{name}.bias"), &[units], Init::Constant(0.0))?;
-        Ok(Self { w, b, neighbours, width })
-    }
-
-    fn forward(&self, features: &Features) -> CandleResult<Tensor> {
-        let shape = (features.counts.len(), self.neighbours, self.width);
-        let neighbours = Tensor::from_slice(&features.neighbours, shape, &Device::Cpu)?;
-        neighbour_pool(&neighbours, features.counts.clone(), &self.w, &self.b)
     }
 }
 

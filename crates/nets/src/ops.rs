@@ -6,7 +6,10 @@
 
 mod action_log_probs;
 mod attention;
+mod buffer;
+mod chain;
 mod elementwise;
+mod gradient;
 mod graph;
 mod gru;
 mod linear;
@@ -21,10 +24,11 @@ mod simd;
 pub use action_log_probs::action_log_probs;
 pub use attention::{Attention, attention};
 pub(crate) use attention::{Keys, attend};
+pub use chain::{Chain, ChainBuilder, Field};
 pub(crate) use elementwise::gelu_in_place;
-pub use elementwise::{elu, exp, gelu, softmax, tanh};
+pub use elementwise::{clamp, elu, exp, gelu, softmax, tanh};
 pub use graph::{GraphBlock, GraphNoise, graph_block};
-pub use gru::gru;
+pub use gru::Gru;
 pub use linear::linear;
 pub use matmul::Activation;
 pub(crate) use matmul::{Packed, matmul};
@@ -34,7 +38,7 @@ pub(crate) use norm::layer_norm_in_place;
 pub(crate) use picks::{Mask, MaskedSoftmax};
 pub use picks::{Pick, PickTable, pick_log_probs};
 pub use pool::{mean_of_others, neighbour_pool};
-pub(crate) use simd::{LANES, load};
+pub(crate) use simd::{LANES, exp_of_negative, load};
 
 use candle_core::{Device, Result, Tensor};
 

@@ -43,6 +43,9 @@ pub struct Entry {
     pub init: Init,
     /// First index in [`Params::values`].
     pub start: usize,
+    /// Entries of the same number stand side by side in one tensor, flat if they are several: the operation that reads them gives
+    /// one gradient for all.
+    pub group: usize,
 }
 
 impl Entry {
@@ -66,6 +69,7 @@ pub struct Params {
 pub struct ParamBuilder {
     entries: Vec<Entry>,
     count: usize,
+    groups: usize,
     given: Option<Vec<Tensor>>,
 }
 
@@ -82,9 +86,29 @@ impl ParamBuilder {
 
     /// The next tensor.
     pub fn tensor(&mut self, name: &str, shape: &[usize], init: Init) -> Result<Tensor, ParamError> {
+        self.entry(name.to_owned(), shape, init);
+        self.hand_out(name, shape)
+    }
+
+    /// The next tensors as one flat tensor, in this order.
+    pub(crate) fn group(&mut self, members: Vec<(String, Vec<usize>, Init)>) -> Result<Tensor, ParamError> {
+        let (first, start) = (members.first().map(|(name, ..)| name.clone()).unwrap_or_default(), self.count);
+        for (name, shape, init) in members {
+            self.entry(name, &shape, init);
+        }
+        self.hand_out(&first, &[self.count - start])
+    }
+
+    fn entry(&mut self, name: String, shape: &[usize], init: Init) {
+        let entry = Entry { name, shape: shape.to_vec(), init, start: self.count, group: self.groups };
+        self.count = entry.range().end;
+        self.entries.push(entry);
+    }
+
+    fn hand_out(&mut self, name: &str, shape: &[usize]) -> Result<Tensor, ParamError> {
         let tensor = match &self.given {
             None => Tensor::zeros(shape, DType::F32, &Device::Cpu)?,
-            Some(given) => match given.get(self.entries.len()) {
+            Some(given) => match given.get(self.groups) {
                 Some(tensor) if tensor.dims() == shape => tensor.clone(),
                 other => {
                     let found = other.map(Tensor::dims);
@@ -94,9 +118,7 @@ impl ParamBuilder {
                 }
             },
         };
-        let entry = Entry { name: name.to_owned(), shape: shape.to_vec(), init, start: self.count };
-        self.count = entry.range().end;
-        self.entries.push(entry);
+        self.groups += 1;
         Ok(tensor)
     }
 
@@ -149,14 +171,20 @@ impl Params {
         Ok(Self { entries, values })
     }
 
-    /// Constant tensors: a forward pass on them records no graph.
+    /// Constant tensors, one for each group: a forward pass on them records no graph.
     pub fn tensors(&self) -> CandleResult<Vec<Tensor>> {
-        let tensor = |e: &Entry| Tensor::from_slice(&self.values[e.range()], e.shape.as_slice(), &Device::Cpu);
-        self.entries.iter().map(tensor).collect()
+        let tensor = |group: &[Entry]| match group {
+            [e] => Tensor::from_slice(&self.values[e.range()], e.shape.as_slice(), &Device::Cpu),
+            _ => {
+                let range = group.first().map_or(0, |e| e.start)..group.last().map_or(0, |e| e.range().end);
+                Tensor::from_slice(&self.values[range.clone()], range.len(), &Device::Cpu)
+            }
+        };
+        self.entries.chunk_by(|a, b| a.group == b.group).map(tensor).collect()
     }
 
-    /// Variables: a forward pass on them can be differentiated. They own a copy of the values, which is cheap at the size of
-    /// these networks and lets several threads differentiate at once.
+    /// Variables, one for each group: a forward pass on them can be differentiated, by several threads at once. They own a copy of the
+    /// values.
     pub fn variables(&self) -> CandleResult<Vec<Var>> {
         self.tensors()?.iter().map(Var::from_tensor).collect()
     }

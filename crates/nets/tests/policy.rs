@@ -12,6 +12,7 @@ use magex_nets::executor::{Act, Chooser, Evaluated, Input, Model, Policy};
 use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params, to_safetensors};
+use std::sync::Arc;
 
 /// Logits of agent i = features_i · w + Σ over agents before it of v[action]: the smallest policy whose agents see what the
 /// agents before them do.
@@ -111,19 +112,19 @@ fn normal(n: usize, tag: u32) -> Vec<f32> {
 const AGENTS: usize = 4;
 const STATES: usize = 6;
 
-fn features(model: &Model, task: &TaskConfig) -> Features {
+fn features(model: &Model, task: &TaskConfig) -> Arc<Features> {
     let s = task.shape(STATES);
     let landmarks = Statics::landmarks(s.landmarks, s.dims, normal(STATES * s.landmarks * s.dims, 3));
-    model.spec().compute(&JointState {
+    Arc::new(model.spec().compute(&JointState {
         positions: &normal(STATES * s.bodies * s.dims, 1),
         velocities: &normal(STATES * s.bodies * s.dims, 2),
         agent_state: &[],
         statics: landmarks.view(),
         goals: &(0..STATES).flat_map(|_| 0..AGENTS as u32).collect::<Vec<_>>(),
-    })
+    }))
 }
 
-fn input<'a>(features: &'a Features, memory: usize) -> Input<'a> {
+fn input<'a>(features: &'a Arc<Features>, memory: usize) -> Input<'a> {
     let hidden = vec![0.1; STATES * AGENTS * memory];
     Input { steps: 1, sequences: STATES, agents: AGENTS, features, hidden, noise: GraphNoise::Off }
 }

@@ -66,16 +66,20 @@ fn networks_of_another_algorithm_come_back_under_their_own_names() {
 }
 
 #[test]
-fn a_folder_of_the_format_before_is_rejected_by_name() {
+fn a_folder_of_a_format_before_is_rejected_by_name() {
     let run = tempfile::tempdir().unwrap();
     let state = learned();
     let folder = write(run.path(), &progress(1), &state, 3).unwrap();
     check_format(run.path()).unwrap();
-    fs::write(folder.join(MANIFEST), "{\"format\": 1, \"sha256\": {}}").unwrap();
-    fs::write(folder.join("state.json"), "{\"format\": 1}").unwrap();
-    for error in [check_format(run.path()).unwrap_err(), read(&folder, &state).unwrap_err()] {
-        let expected = "written by magex 0.1.0 (commit 389f705), which reads it; this is magex 0.2.0";
-        assert!(error.to_string().contains(expected), "{error}");
+    for (format, writer) in [(2, "0.2.0 (commit 335875b or before)"), (1, "0.1.0 (commit 389f705)")] {
+        fs::write(folder.join(MANIFEST), format!("{{\"format\": {format}, \"sha256\": {{}}}}")).unwrap();
+        // Damage, as long as it is in one file only.
+        check_format(run.path()).unwrap();
+        fs::write(folder.join("state.json"), format!("{{\"format\": {format}}}")).unwrap();
+        for error in [check_format(run.path()).unwrap_err(), read(&folder, &state).unwrap_err()] {
+            let expected = format!("written by magex {writer}, which reads it; this is magex 0.2.0");
+            assert!(error.to_string().contains(&expected), "{error}");
+        }
     }
 }
 

@@ -103,11 +103,11 @@ pub(crate) struct Slice<'a> {
 }
 
 impl Slice<'_> {
-    pub(crate) fn features(&self) -> Features {
-        self.batch.gather(self.units, self.chunk)
+    pub(crate) fn features(&self) -> Arc<Features> {
+        Arc::new(self.batch.gather(self.units, self.chunk))
     }
 
-    pub(crate) fn input<'f>(&self, features: &'f Features, hidden: Vec<f32>, noise: GraphNoise) -> Input<'f> {
+    pub(crate) fn input<'f>(&self, features: &'f Arc<Features>, hidden: Vec<f32>, noise: GraphNoise) -> Input<'f> {
         let (sequences, agents) = (self.units.len(), self.batch.shape.agents);
         Input { steps: self.chunk, sequences, agents, features, hidden, noise }
     }

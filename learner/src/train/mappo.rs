@@ -18,6 +18,9 @@
 //! | 13 | log-probabilities that the first minibatch (with memories: every chunk) does not reproduce refuse the batch before anything is changed | ours |
 //! | 14 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
 
+mod sums;
+
+use self::sums::{PolicySums, Totals};
 use crate::train::batch::{Batch, Slice, column, sum_of_rows};
 use crate::train::gae::{Gae, ValueNorm};
 use crate::train::learned::{Learned, Network};
@@ -26,16 +29,26 @@ use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Result as CandleResult, Tensor, Var};
 use magex_core::config::RunConfig;
 use magex_core::rng::{Key, Purpose};
-use magex_nets::executor::{Model, Part};
-use magex_nets::features::FeatureSpec;
+use magex_nets::executor::{self as nets, Model, Part, Policy};
+use magex_nets::features::{FeatureSpec, Features};
 use magex_nets::ops::{self, GraphNoise};
 use magex_nets::params::{ParamBuilder, ParamError, Params};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 type Result<T> = std::result::Result<T, ParamError>;
 
 /// The gradient of each network, as flat as its parameters; empty for networks that a loss does not read.
 type Gradients = Vec<Vec<f32>>;
+
+/// A network and the variables that it is on, one list for each part.
+type Differentiable<T> = (Box<T>, Vec<Vec<Var>>);
+
+/// Policy and value function.
+type Functions = (Box<dyn Policy>, Box<dyn nets::Network>);
+
+/// Rows of one pass of a network without memory, about: a longer pass gains nothing, and some need much room for one.
+const AT_ONCE: usize = 2048;
 
 /// The algorithm with its settings.
 #[derive(Debug)]
@@ -108,9 +121,10 @@ impl Mappo {
         let networks = &mut learned.networks[..parts.len()];
 
         // 1. Values and memories under the weights that collected the batch.
+        let constants = self.constants(networks)?;
         let evaluations: Vec<Evaluation> = (0..episodes)
             .into_par_iter()
-            .map(|episode| self.evaluate(networks, batch, episode))
+            .map(|episode| self.evaluate(&constants, batch, episode))
             .collect::<Result<_>>()?;
         for (episode, evaluation) in evaluations.iter().enumerate() {
             check_log_probs(episode, evaluation.error)?;
@@ -153,16 +167,23 @@ impl Mappo {
                 let moments = value_norm.moments();
 
                 // 5. Gradients of both losses, slice by slice.
+                let (policy, value) = (self.policy(networks)?, self.value(networks)?);
                 let count = m.gradient_slices.min(units.len());
                 let slice = |s| Slice { batch, units: &units[part(units.len(), count, s)], chunk: self.chunk, samples };
                 let slices: Vec<Slice<'_>> = (0..count).map(slice).collect();
-                let policy_loss = |s| self.policy_loss(networks, s, &evaluations, &advantages);
-                let value_loss = |s| self.value_loss(networks, s, &evaluations, &returns, &old_values, moments);
-                let (policy, value) = rayon::join(
-                    || slices.par_iter().map(policy_loss).collect::<Result<Vec<_>>>(),
-                    || slices.par_iter().map(value_loss).collect::<Result<Vec<_>>>(),
-                );
-                let (policy, value) = (policy?, value?);
+                let losses = |s: &Slice<'_>| {
+                    let features = s.features();
+                    let (policy, value) = rayon::join(
+                        || self.policy_loss(networks, &policy, (s, &features), &evaluations, &advantages),
+                        || {
+                            let (slice, targets) = ((s, &features), (&returns[..], moments));
+                            self.value_loss(networks, &value, slice, &evaluations, targets, &old_values)
+                        },
+                    );
+                    Ok((policy?, value?))
+                };
+                let both = slices.par_iter().map(losses).collect::<Result<Vec<_>>>()?;
+                let (policy, value): (Vec<_>, Vec<_>) = both.into_iter().unzip();
                 if epoch == 0 && index == 0 {
                     // The networks are still those that acted.
                     for (slice, (_, sums)) in slices.iter().zip(&policy) {
@@ -225,17 +246,14 @@ impl Mappo {
 
     /// Values of all T+1 states of one episode, and the memories entering each chunk, by running both networks through
     /// the episode a chunk at a time.
-    fn evaluate(&self, networks: &[Network], batch: &Batch, episode: usize) -> Result<Evaluation> {
+    fn evaluate(&self, (policy, value): &Functions, batch: &Batch, episode: usize) -> Result<Evaluation> {
         let (steps, n, memory) = (batch.shape.steps, batch.shape.agents, self.model.memory());
-        let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
-        let constants = || networks.iter().map(constant).collect::<Result<Vec<_>>>();
-        let (policy, value) = (self.model.policy(&mut constants()?)?, self.model.value(&mut constants()?)?);
         let values = Vec::with_capacity((steps + 1) * n);
         let mut out = Evaluation { values, policy_memory: Vec::new(), value_memory: Vec::new(), error: 0.0 };
         let mut value_hidden = vec![0.0; n * memory];
         let mut policy_hidden = value_hidden.clone();
         // Networks without memory have no chunks to respect: a chunk's length only bounds the working memory.
-        let stride = if memory == 0 { 10 } else { self.chunk };
+        let stride = if memory == 0 { (AT_ONCE / n).max(10) } else { self.chunk };
         let mut start = 0;
         while start <= steps {
             let count = stride.min(steps + 1 - start);
@@ -263,15 +281,14 @@ impl Mappo {
     fn policy_loss(
         &self,
         networks: &[Network],
-        slice: &Slice<'_>,
+        (policy, variables): &Differentiable<dyn Policy>,
+        (slice, features): (&Slice<'_>, &Arc<Features>),
         evaluations: &[Evaluation],
         advantages: &[f32],
     ) -> Result<(Gradients, PolicySums)> {
         let m = &self.config.mappo;
-        let (variables, mut parts) = self.variables(networks, |part| part.policy)?;
-        let policy = self.model.policy(&mut parts)?;
         let hidden = slice.memories(|episode| &evaluations[episode].policy_memory);
-        let now = policy.evaluate(&slice.input(&slice.features(), hidden, slice.noise()), &slice.actions())?;
+        let now = policy.evaluate(&slice.input(features, hidden, slice.noise()), &slice.actions())?;
 
         let log_ratio = (now.log_probs - slice.column(&slice.batch.log_probs)?)?;
         let (log_ratio, advantages, entropies, agents) = if m.joint_ratio {
@@ -291,24 +308,22 @@ impl Mappo {
         let loss = (objective.sum_all()? * (-weight / f64::from(slice.samples)))?;
 
         let sums = PolicySums::of(&surrogate, &entropies, &ratio, &log_ratio, m.clip_epsilon)?.times(weight);
-        Ok((gradients(networks, &variables, &loss)?, sums))
+        Ok((gradients(networks, variables, &loss)?, sums))
     }
 
     /// Loss of the value function on one slice of a minibatch: [`clipped_value_loss`] in normalised units, and its sum.
     fn value_loss(
         &self,
         networks: &[Network],
-        slice: &Slice<'_>,
+        (value, variables): &Differentiable<dyn nets::Network>,
+        (slice, features): (&Slice<'_>, &Arc<Features>),
         evaluations: &[Evaluation],
-        returns: &[f32],
+        (returns, (mean, deviation)): (&[f32], (f32, f32)),
         old_values: &[f32],
-        (mean, deviation): (f32, f32),
     ) -> Result<(Gradients, f64)> {
         let m = &self.config.mappo;
-        let (variables, mut parts) = self.variables(networks, |part| part.value)?;
-        let value = self.model.value(&mut parts)?;
         let hidden = slice.memories(|episode| &evaluations[episode].value_memory);
-        let values = value.forward(&slice.input(&slice.features(), hidden, GraphNoise::Off))?.out.flatten_all()?;
+        let values = value.forward(&slice.input(features, hidden, GraphNoise::Off))?.out.flatten_all()?;
 
         let mut targets = slice.batch.rows(returns, 1, slice.units, slice.chunk);
         targets.iter_mut().for_each(|r| *r = (*r - mean) / deviation);
@@ -316,7 +331,26 @@ impl Mappo {
         let losses = clipped_value_loss(&values, &old_values, &targets, m.clip_epsilon, m.huber_delta)?;
         let loss = (losses.sum_all()? * (1.0 / f64::from(slice.samples)))?;
 
-        Ok((gradients(networks, &variables, &loss)?, sum(&losses)?))
+        Ok((gradients(networks, variables, &loss)?, sum(&losses)?))
+    }
+
+    /// Policy and value function without a gradient.
+    fn constants(&self, networks: &[Network]) -> Result<Functions> {
+        let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
+        let constants = || networks.iter().map(constant).collect::<Result<Vec<_>>>();
+        Ok((self.model.policy(&mut constants()?)?, self.model.value(&mut constants()?)?))
+    }
+
+    /// The policy on variables, which all slices of a minibatch share.
+    fn policy(&self, networks: &[Network]) -> Result<Differentiable<dyn Policy>> {
+        let (variables, mut parts) = self.variables(networks, |part| part.policy)?;
+        Ok((self.model.policy(&mut parts)?, variables))
+    }
+
+    /// The same for the value function.
+    fn value(&self, networks: &[Network]) -> Result<Differentiable<dyn nets::Network>> {
+        let (variables, mut parts) = self.variables(networks, |part| part.value)?;
+        Ok((self.model.value(&mut parts)?, variables))
     }
 
     /// Variables of the parts that a loss reads (none of the others), and a builder for each part.
@@ -333,13 +367,13 @@ impl Mappo {
 
 /// min(ρ A, clip(ρ, 1 ± ε) A), element by element.
 pub(crate) fn clipped_surrogate(ratio: &Tensor, advantages: &Tensor, clip: f32) -> CandleResult<Tensor> {
-    let clipped = (ratio.clamp(1.0 - clip, 1.0 + clip)? * advantages)?;
+    let clipped = (ops::clamp(ratio, 1.0 - clip, 1.0 + clip)? * advantages)?;
     (ratio * advantages)?.minimum(&clipped)
 }
 
 /// max( hub(y − V_c), hub(y − V) ) with V_c = V_old + clip(V − V_old, ± ε), element by element.
 fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32, delta: f32) -> CandleResult<Tensor> {
-    let clipped = (old + (values - old)?.clamp(-clip, clip)?)?;
+    let clipped = (old + ops::clamp(&(values - old)?, -clip, clip)?)?;
     huber(&(targets - values)?, delta)?.maximum(&huber(&(targets - clipped)?, delta)?)
 }
 
@@ -347,7 +381,7 @@ fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32
 /// both are m (|e| − m/2), whose gradient has no term of the size of δ that would have to cancel.
 fn huber(error: &Tensor, delta: f32) -> CandleResult<Tensor> {
     let size = error.abs()?;
-    let inner = size.minimum(delta)?;
+    let inner = ops::clamp(&size, 0.0, delta)?;
     &inner * (size - (&inner * 0.5)?)?
 }
 
@@ -355,54 +389,6 @@ fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Res
     let store = loss.backward()?;
     let flat = |(network, variables): (&Network, &Vec<Var>)| Ok(network.params.gradient(variables, &store)?);
     networks.iter().zip(variables).map(flat).collect()
-}
-
-/// Sums over rows, in order and in double precision.
-#[derive(Debug, Clone, Copy, Default)]
-struct PolicySums {
-    loss: f64,
-    entropy: f64,
-    /// Rows whose ratio is outside 1 ± ε.
-    clipped: f64,
-    /// Σ (ρ − 1 − ln ρ), the estimator of the KL divergence from the old policy (Schulman's k3).
-    kl: f64,
-    /// max |ρ − 1|.
-    ratio_error: f64,
-    /// max |ln ρ|, and its row.
-    worst: (f64, usize),
-}
-
-impl PolicySums {
-    fn of(surrogate: &Tensor, entropies: &Tensor, ratio: &Tensor, log_ratio: &Tensor, clip: f32) -> Result<Self> {
-        let mut sums = Self { loss: -sum(surrogate)?, entropy: sum(entropies)?, ..Self::default() };
-        for (row, (ratio, log_ratio)) in
-            ratio.to_vec1::<f32>()?.into_iter().zip(log_ratio.to_vec1::<f32>()?).enumerate()
-        {
-            let error = worse(sums.worst.0, log_ratio);
-            if error > sums.worst.0 {
-                sums.worst = (error, row);
-            }
-            sums.clipped += f64::from(u8::from((ratio - 1.0).abs() > clip));
-            sums.kl += f64::from(ratio - 1.0 - log_ratio);
-            sums.ratio_error = sums.ratio_error.max(f64::from((ratio - 1.0).abs()));
-        }
-        Ok(sums)
-    }
-
-    /// Of rows that stand for several samples each.
-    fn times(self, weight: f64) -> Self {
-        let Self { loss, entropy, clipped, kl, ratio_error, worst } = self;
-        let [loss, entropy, clipped, kl] = [loss, entropy, clipped, kl].map(|sum| sum * weight);
-        Self { loss, entropy, clipped, kl, ratio_error, worst }
-    }
-
-    fn add(&mut self, other: &Self) {
-        self.loss += other.loss;
-        self.entropy += other.entropy;
-        self.clipped += other.clipped;
-        self.kl += other.kl;
-        self.ratio_error = self.ratio_error.max(other.ratio_error);
-    }
 }
 
 /// The larger of an error and |x|; infinite if x is no number.
@@ -416,39 +402,6 @@ fn check_log_probs(episode: usize, error: f64) -> std::result::Result<(), Suspec
         return Ok(());
     }
     Err(Suspect { trajectory: episode, field: "log_probs", error, limit: LOG_PROB_TOLERANCE })
-}
-
-/// Sums over the minibatches of an update.
-#[derive(Default)]
-struct Totals {
-    minibatches: f64,
-    /// Policy loss, value loss, entropy, clip fraction, KL divergence.
-    means: [f64; 5],
-    /// Norm of each network's gradient before clipping.
-    grad_norms: Vec<f64>,
-    first_ratio_error: f64,
-    skipped: f64,
-}
-
-impl Totals {
-    fn minibatch(&mut self, policy: &PolicySums, value: f64, norms: &[f64], samples: f64) {
-        self.minibatches += 1.0;
-        let sums = [policy.loss, value, policy.entropy, policy.clipped, policy.kl];
-        self.means.iter_mut().zip(sums).for_each(|(mean, sum)| *mean += sum / samples);
-        self.grad_norms.iter_mut().zip(norms).for_each(|(total, norm)| *total += norm);
-    }
-
-    fn stats(self, parts: &[Part]) -> UpdateStats {
-        let count = self.minibatches.max(1.0);
-        let mut stats = UpdateStats::default();
-        let names = ["policy_loss", "value_loss", "entropy", "clip_fraction", "approx_kl"];
-        names.into_iter().zip(self.means).for_each(|(name, sum)| stats.push(name, sum / count));
-        stats.push("first_ratio_error", self.first_ratio_error);
-        let norms = parts.iter().zip(&self.grad_norms);
-        norms.for_each(|(part, sum)| stats.push(format!("{}_grad_norm", part.name), sum / count));
-        stats.push("skipped_minibatches", self.skipped);
-        stats
-    }
 }
 
 /// (A − mean) / (standard deviation + 1e-5) over all samples.

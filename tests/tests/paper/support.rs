@@ -49,7 +49,7 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
     let states =
         JointState { positions, velocities: &velocities, agent_state: &[], statics: statics.view(), goals: &goals };
     let noise = noise.map_or(GraphNoise::Off, |key| GraphNoise::Keyed(Arc::new(vec![key])));
-    let features = mappo.spec().compute(&states);
+    let features = std::sync::Arc::new(mappo.spec().compute(&states));
     let input = Input { steps: 1, sequences: 1, agents: n, features: &features, hidden: hidden.to_vec(), noise };
     let output = network.forward(&input).unwrap();
     let flat = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();

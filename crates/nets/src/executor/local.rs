@@ -1,20 +1,15 @@
 //! The `local` executor: an agent, its goal and its k nearest neighbours. No graph, no memory.
 
-use super::{Input, Layer, NeighbourEncoder, Network, Output, RELU_GAIN};
+use super::{Input, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, constant};
+use crate::ops::{Activation, Chain, ChainBuilder};
 use crate::params::{ParamBuilder, ParamError};
-use candle_core::{Result as CandleResult, Tensor};
-use candle_nn::Module;
+use candle_core::Result as CandleResult;
 use magex_core::config::ExecutorConfig;
 
 /// own → h; Σ over neighbours of relu(neighbour → h/2); `[both]` → h → outputs.
 pub(super) struct LocalNet {
-    own: Layer,
-    neighbours: NeighbourEncoder,
-    mix: Layer,
-    head: Layer,
-    goal_width: usize,
+    chain: Chain,
 }
 
 impl LocalNet {
@@ -26,22 +21,18 @@ impl LocalNet {
         head_gain: f64,
         params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
-        let (h, half) = (config.hidden, config.hidden / 2);
-        Ok(Self {
-            own: Layer::build(params, "own", (spec.goal_width(), h), Activation::Relu, RELU_GAIN)?.on_features(),
-            neighbours: NeighbourEncoder::build(params, "neighbour", spec, half)?,
-            mix: Layer::build(params, "mix", (h + half, h), Activation::Relu, RELU_GAIN)?,
-            head: Layer::build(params, "head", (h, outputs), Activation::Identity, head_gain)?,
-            goal_width: spec.goal_width(),
-        })
+        let (h, relu) = (config.hidden, Activation::Relu);
+        let chain = ChainBuilder::new()
+            .features("own", |features| &features.goals, (spec.goal_width(), h), relu, RELU_GAIN)
+            .neighbours("neighbour", spec.neighbours, (spec.neighbour_width(), h / 2), RELU_GAIN)
+            .dense("mix", h, relu, RELU_GAIN)
+            .dense("head", outputs, Activation::Identity, head_gain);
+        Ok(Self { chain: chain.build(params)? })
     }
 }
 
 impl Network for LocalNet {
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
-        let own = self.own.forward(&constant(input.features.goals.as_slice(), self.goal_width)?)?;
-        let team = self.neighbours.forward(input.features)?;
-        let mixed = self.mix.forward(&Tensor::cat(&[&own, &team], 1)?)?;
-        Ok(Output { out: self.head.forward(&mixed)?, states: None })
+        Ok(Output { out: self.chain.forward(None, input.features)?, states: None })
     }
 }

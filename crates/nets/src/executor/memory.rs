@@ -1,7 +1,7 @@
 //! The memory of an executor: a gated recurrent unit with layer normalisation behind it.
 
-use super::{Input, Layer};
-use crate::ops::{Activation, gru, layer_norm};
+use super::{Input, Output};
+use crate::ops::{Activation, Chain, ChainBuilder, Gru, layer_norm};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -26,32 +26,44 @@ impl Module for Norm {
     }
 }
 
-/// GRU of H units, H a multiple of 16.
+/// A network from what enters its memory to its outputs: layers, GRU of H units (a multiple of 16), layer normalisation, head.
 pub(super) struct Memory {
-    gates: Layer,
-    weight: Tensor,
-    bias: Tensor,
-    norm: Norm,
+    /// Ends with the input projection of the gates [R, 3H].
+    gates: Chain,
+    gru: Gru,
+    head: Chain,
     width: usize,
 }
 
 impl Memory {
-    pub(super) fn build(params: &mut ParamBuilder, width: usize) -> Result<Self, ParamError> {
+    /// `first` gives what the gates see.
+    pub(super) fn build(
+        first: ChainBuilder,
+        width: usize,
+        (outputs, head_gain): (usize, f64),
+        params: &mut ParamBuilder,
+    ) -> Result<Self, ParamError> {
+        let identity = Activation::Identity;
+        let gates = first.dense("gru.input", 3 * width, identity, 1.0).build(params)?;
+        let weight = params.tensor("gru.weight", &[width, 3 * width], Init::Orthogonal(1.0))?;
         Ok(Self {
-            gates: Layer::build(params, "gru.input", (width, 3 * width), Activation::Identity, 1.0)?,
-            weight: params.tensor("gru.weight", &[width, 3 * width], Init::Orthogonal(1.0))?,
-            bias: params.tensor("gru.bias", &[3 * width], Init::Constant(0.0))?,
-            norm: Norm::build(params, "gru.norm", width)?,
+            gates,
+            gru: Gru::new(weight, params.tensor("gru.bias", &[3 * width], Init::Constant(0.0))?),
+            head: ChainBuilder::new()
+                .input(width)
+                .norm("gru.norm")
+                .dense("head", outputs, identity, head_gain)
+                .build(params)?,
             width,
         })
     }
 
-    /// From x [L·C·N, H] to normalised features [L·C·N, H] and the states [L, C·N, H] after each step.
-    pub(super) fn forward(&self, x: &Tensor, input: &Input<'_>) -> CandleResult<(Tensor, Tensor)> {
+    /// `x` is the input of the first layers, if they have one.
+    pub(super) fn forward(&self, x: Option<&Tensor>, input: &Input<'_>) -> CandleResult<Output> {
         let sequences = input.sequences * input.agents;
-        let gates = self.gates.forward(x)?.reshape((input.steps, sequences, 3 * self.width))?;
-        let states = gru(&gates, &self.weight, &self.bias, input.hidden.clone())?;
+        let gates = self.gates.forward(x, input.features)?.reshape((input.steps, sequences, 3 * self.width))?;
+        let states = self.gru.forward(&gates, input.hidden.clone())?;
         let flat = states.reshape((input.steps * sequences, self.width))?;
-        Ok((self.norm.forward(&flat)?, states))
+        Ok(Output { out: self.head.forward(Some(&flat), input.features)?, states: Some(states) })
     }
 }

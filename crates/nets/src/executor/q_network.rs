@@ -7,7 +7,7 @@
 use super::{Act, Chooser, Input, Layer};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, constant, gru, with_values};
+use crate::ops::{Activation, Gru, constant, with_values};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -26,8 +26,8 @@ pub struct QNetwork {
 
 enum Second {
     Layer(Layer),
-    /// Gated recurrent unit: input projection, recurrent weights and biases.
-    Memory(Layer, Tensor, Tensor),
+    /// Input projection and gated recurrent unit.
+    Memory(Layer, Gru),
 }
 
 /// Choices [.., H] as ones in rows of zeros [.., A].
@@ -54,7 +54,7 @@ impl QNetwork {
             second: if config.executor.recurrent {
                 let input = Layer::uniform(params, "gru.input", (h, 3 * h), Activation::Identity)?;
                 let weight = params.tensor("gru.weight", &[h, 3 * h], bound)?;
-                Second::Memory(input, weight, params.tensor("gru.bias", &[3 * h], bound)?)
+                Second::Memory(input, Gru::new(weight, params.tensor("gru.bias", &[3 * h], bound)?))
             } else {
                 Second::Layer(Layer::uniform(params, "second", (h, h), Activation::Relu)?)
             },
@@ -95,10 +95,10 @@ impl QNetwork {
         let first = self.first.forward(&inputs)?;
         let (features, states) = match &self.second {
             Second::Layer(layer) => (layer.forward(&first)?, None),
-            Second::Memory(input, weight, bias) => {
+            Second::Memory(input, gru) => {
                 let rows = vectors.len() / width / steps;
                 let gates = input.forward(&first)?.reshape((steps, rows, 3 * self.hidden))?;
-                let states = gru(&gates, weight, bias, memory)?;
+                let states = gru.forward(&gates, memory)?;
                 (states.reshape((steps * rows, self.hidden))?, Some(states))
             }
         };

@@ -1,9 +1,9 @@
 //! The paper's executor: Subgraph Extractor, Goal Encoder, State Extractor, Action Generator; and its ablations.
 
-use super::memory::{Memory, Norm};
-use super::{Input, Layer, NeighbourEncoder, Network, Output, RELU_GAIN};
+use super::memory::Memory;
+use super::{Input, Layer, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, GraphBlock, constant, graph_block, linear, mean_of_others, softmax};
+use crate::ops::{Activation, Chain, ChainBuilder, GraphBlock, constant, graph_block, linear, mean_of_others, softmax};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -17,7 +17,6 @@ const HEAD_WIDTH: usize = 16;
 enum Team {
     /// Observation Encoder with a fully connected GCN, then hard Gumbel-softmax blocks.
     Graph {
-        encode: Layer,
         blocks: Vec<Block>,
         literal: bool,
     },
@@ -31,8 +30,8 @@ enum Team {
 }
 
 struct Block {
-    /// h → [u | v | z | self].
-    project: Layer,
+    /// h → [u | v | z | self], in the first block behind the layer that gives h.
+    project: Chain,
     /// Pair offsets → P; `None` in the literal reading.
     relative: Option<Tensor>,
     score: Tensor,
@@ -43,13 +42,13 @@ impl Block {
     fn build(
         config: &ExecutorConfig,
         spec: &FeatureSpec,
-        b: usize,
+        (b, first): (usize, ChainBuilder),
         params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
         let (f, p, literal) = (config.feature_size, config.pair_hidden, config.kind == ExecutorKind::MagexLiteral);
         let (project, relative) = (format!("block{b}.project"), format!("block{b}.relative"));
         Ok(Self {
-            project: Layer::build(params, &project, (f, 2 * p + 2 * f), Activation::Identity, 1.0)?,
+            project: first.dense(&project, 2 * p + 2 * f, Activation::Identity, 1.0).build(params)?,
             relative: if literal {
                 None
             } else {
@@ -70,15 +69,11 @@ impl Block {
 
 /// Paper, figure 2. F = feature size.
 pub(super) struct TeamNet {
-    observe: Layer,
+    observe: Chain,
     team: Team,
-    goal: Layer,
-    /// Encounter Encoder: Σ over neighbours of relu(neighbour → F / 2), where the task has encounters.
-    encounters: Option<NeighbourEncoder>,
-    fuse_norm: Option<Norm>,
-    state: Layer,
-    memory: Memory,
-    head: Layer,
+    /// Goal Encoder, State Extractor, memory and head. Where the task has encounters, there is an Encounter Encoder, too:
+    /// Σ over neighbours of relu(neighbour → F / 2).
+    rest: Memory,
     spec: FeatureSpec,
     width: usize,
     pair_hidden: usize,
@@ -96,7 +91,9 @@ impl TeamNet {
         let f = config.feature_size;
         let p = config.pair_hidden;
         let relu = Activation::Relu;
-        let observe = Layer::build(params, "f_o", (spec.node_width(), f), relu, RELU_GAIN)?.on_features();
+        let nodes = (spec.node_width(), f);
+        let observe = ChainBuilder::new().features("f_o", |features| &features.nodes, nodes, relu, RELU_GAIN);
+        let observe = observe.build(params)?;
         let team = match config.kind {
             ExecutorKind::Attention => {
                 let inner = HEADS * HEAD_WIDTH;
@@ -111,24 +108,28 @@ impl TeamNet {
             _ => {
                 let literal = config.kind == ExecutorKind::MagexLiteral;
                 let inputs = if literal { f } else { 2 * f };
-                let encode = Layer::build(params, "gcn", (inputs, f), relu, RELU_GAIN)?;
-                let blocks = (0..config.graph_blocks).map(|b| Block::build(config, spec, b, params));
+                let first = |b: usize| match b {
+                    0 => ChainBuilder::new().input(inputs).dense("gcn", f, relu, RELU_GAIN),
+                    _ => ChainBuilder::new().input(f),
+                };
+                let blocks = (0..config.graph_blocks).map(|b| Block::build(config, spec, (b, first(b)), params));
                 let blocks = blocks.collect::<Result<_, _>>()?;
-                Team::Graph { encode, blocks, literal }
+                Team::Graph { blocks, literal }
             }
         };
-        let near = spec.neighbours > 0;
-        let fused = 2 * f + if near { f / 2 } else { 0 };
-        let encounters = if near { Some(NeighbourEncoder::build(params, "f_near", spec, f / 2)?) } else { None };
+        let goals = (spec.goal_width(), f);
+        let mut fused =
+            ChainBuilder::new().features("f_goal", |features| &features.goals, goals, relu, RELU_GAIN).input(f);
+        if spec.neighbours > 0 {
+            fused = fused.neighbours("f_near", spec.neighbours, (spec.neighbour_width(), f / 2), RELU_GAIN);
+        }
+        if config.feature_norm {
+            fused = fused.norm("f_state.norm");
+        }
         Ok(Self {
             observe,
             team,
-            encounters,
-            goal: Layer::build(params, "f_goal", (spec.goal_width(), f), relu, RELU_GAIN)?.on_features(),
-            fuse_norm: if config.feature_norm { Some(Norm::build(params, "f_state.norm", fused)?) } else { None },
-            state: Layer::build(params, "f_state", (fused, f), relu, RELU_GAIN)?,
-            memory: Memory::build(params, f)?,
-            head: Layer::build(params, "head", (f, outputs), Activation::Identity, head_gain)?,
+            rest: Memory::build(fused.dense("f_state", f, relu, RELU_GAIN), f, (outputs, head_gain), params)?,
             spec: *spec,
             width: f,
             pair_hidden: p,
@@ -139,21 +140,21 @@ impl TeamNet {
     fn team_features(&self, input: &Input<'_>) -> CandleResult<Tensor> {
         let features = input.features;
         let n = input.agents;
-        let x = self.observe.forward(&constant(features.nodes.as_slice(), self.spec.node_width())?)?;
+        let x = self.observe.forward(None, features)?;
         match &self.team {
-            Team::Graph { encode, blocks, literal } => {
+            Team::Graph { blocks, literal } => {
                 let others = mean_of_others(&x, n)?;
                 let mut h = if *literal {
                     // Mean over all agents, the agent itself included: every node gets the same feature.
                     let share = 1.0 / n as f64;
-                    encode.forward(&((&x * share)? + (others * (1.0 - share))?)?)?
+                    ((&x * share)? + (others * (1.0 - share))?)?
                 } else {
-                    encode.forward(&Tensor::cat(&[&x, &others], 1)?)?
+                    Tensor::cat(&[&x, &others], 1)?
                 };
                 let pairs = constant(features.pairs.as_slice(), 2 * self.spec.shape.dims)?;
                 let zeros = Tensor::zeros(self.pair_hidden, DType::F32, &Device::Cpu)?;
                 for block in blocks {
-                    let projected = block.project.forward(&h)?;
+                    let projected = block.project.forward(Some(&h), features)?;
                     let relative = match &block.relative {
                         Some(w) => linear(&pairs, w, &zeros, Activation::Identity, true)?,
                         None => Tensor::zeros((pairs.dim(0)?, self.pair_hidden), DType::F32, &Device::Cpu)?,
@@ -187,17 +188,6 @@ impl TeamNet {
 
 impl Network for TeamNet {
     fn forward(&self, input: &Input<'_>) -> CandleResult<Output> {
-        let team = self.team_features(input)?;
-        let goal = self.goal.forward(&constant(input.features.goals.as_slice(), self.spec.goal_width())?)?;
-        let mut fused = match &self.encounters {
-            None => Tensor::cat(&[&goal, &team], 1)?,
-            Some(encoder) => Tensor::cat(&[&goal, &team, &encoder.forward(input.features)?], 1)?,
-        };
-        if let Some(norm) = &self.fuse_norm {
-            fused = norm.forward(&fused)?;
-        }
-        let (flat, states) = self.memory.forward(&self.state.forward(&fused)?, input)?;
-        let out = self.head.forward(&flat)?;
-        Ok(Output { out, states: Some(states) })
+        self.rest.forward(Some(&self.team_features(input)?), input)
     }
 }

@@ -1,8 +1,9 @@
 use super::operation::{Arg, Operation, apply1};
-use super::simd::load;
-use crate::distribution::ActionHeads;
+use super::simd::{LANES, exp_of_negative, load};
+use crate::distribution::{ActionHeads, log_softmax_of_rows};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::OnceLock;
+use wide::f32x16;
 
 /// Log-probabilities and entropies of given actions: [2, R] from logits [R, A] and actions [R, H], both summed over the
 /// components of an action. The log-probabilities have the bits of [`ActionHeads::choose`], so the first importance ratio
@@ -14,8 +15,18 @@ pub fn action_log_probs(logits: &Tensor, actions: Vec<u8>, heads: &ActionHeads) 
 struct ActionLogProbs {
     actions: Vec<u8>,
     heads: ActionHeads,
-    /// [R, 2A] log-probabilities and probabilities of every choice, for the gradient.
-    saved: OnceLock<Vec<f32>>,
+    /// [R / 16, A + H] log-probabilities of every choice and entropy of every component, sixteen rows in a vector.
+    saved: OnceLock<Vec<f32x16>>,
+}
+
+impl ActionLogProbs {
+    /// Where each component's choices begin, and how many it has.
+    fn parts(&self) -> impl Iterator<Item = (usize, usize)> {
+        self.heads.sizes().iter().scan(0, |at, &size| {
+            *at += size;
+            Some((*at - size, size))
+        })
+    }
 }
 
 impl Operation<1> for ActionLogProbs {
@@ -28,27 +39,39 @@ impl Operation<1> for ActionLogProbs {
             bail!("action log-probs: {} actions and logits [{rows}, {width}] do not fit", self.actions.len());
         }
         let mut out = vec![0.0; 2 * rows];
-        let mut saved = vec![0.0; 2 * rows * width];
-        let (log_probs_out, entropies) = out.split_at_mut(rows);
-        for (((logits, action), saved), (log_prob, entropy)) in logits
+        let (log_probs_out, entropies_out) = out.split_at_mut(rows);
+        let mut saved = vec![f32x16::ZERO; rows.div_ceil(LANES) * (width + components)];
+        let mut lanes = vec![[0.0f32; LANES]; width];
+        for (((logits, actions), saved), (log_probs_out, entropies_out)) in logits
             .values
-            .chunks_exact(width)
-            .zip(self.actions.chunks_exact(components))
-            .zip(saved.chunks_exact_mut(2 * width))
-            .zip(log_probs_out.iter_mut().zip(entropies))
+            .chunks(LANES * width)
+            .zip(self.actions.chunks(LANES * components))
+            .zip(saved.chunks_exact_mut(width + components))
+            .zip(log_probs_out.chunks_mut(LANES).zip(entropies_out.chunks_mut(LANES)))
         {
-            let (log_probs, probs) = saved.split_at_mut(width);
-            self.heads.log_softmax(logits, log_probs);
-            let mut at = 0;
-            for (&choice, &size) in action.iter().zip(self.heads.sizes()) {
-                let head = at..at + size;
-                let Some(chosen) = log_probs[head.clone()].get(usize::from(choice)) else {
-                    bail!("action log-probs: choice {choice} of {size}");
-                };
-                *log_prob += chosen;
-                probs[head.clone()].copy_from_slice(&load(&log_probs[head.clone()]).exp().to_array()[..size]);
-                *entropy += head_entropy(&log_probs[head.clone()], &probs[head]);
-                at += size;
+            for (row, logits) in logits.chunks_exact(width).enumerate() {
+                lanes.iter_mut().zip(logits).for_each(|(column, logit)| column[row] = *logit);
+            }
+            let (log_probs, entropies) = saved.split_at_mut(width);
+            log_probs.iter_mut().zip(&lanes).for_each(|(column, lanes)| *column = f32x16::new(*lanes));
+            let mut total = f32x16::ZERO;
+            for ((at, size), entropy) in self.parts().zip(entropies) {
+                let head = &mut log_probs[at..at + size];
+                log_softmax_of_rows(head);
+                let sum = head.iter().fold(f32x16::ZERO, |sum, x| sum + exp_of_negative(*x) * *x);
+                *entropy = -sum;
+                total += *entropy;
+            }
+            entropies_out.copy_from_slice(&total.to_array()[..entropies_out.len()]);
+            lanes.iter_mut().zip(log_probs).for_each(|(lanes, column)| *lanes = column.to_array());
+            for (row, (action, out)) in actions.chunks_exact(components).zip(log_probs_out).enumerate() {
+                for (&choice, (at, size)) in action.iter().zip(self.parts()) {
+                    let choice = usize::from(choice);
+                    if choice >= size {
+                        bail!("action log-probs: choice {choice} of {size}");
+                    }
+                    *out += lanes[at + choice][row];
+                }
             }
         }
         // Each call of `action_log_probs` makes its own operation: the cell is empty.
@@ -58,31 +81,31 @@ impl Operation<1> for ActionLogProbs {
 
     fn backward(&self, [logits]: [Arg<'_>; 1], _y: &[f32], upstream: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
         let (rows, width) = logits.rows();
+        let components = self.heads.count();
         let Some(saved) = self.saved.get() else { bail!("action log-probs: gradient without forward") };
         let (d_log_probs, d_entropies) = upstream.split_at(rows);
         let mut gradient = vec![0.0; rows * width];
-        for (((gradient, saved), action), (d_log_prob, d_entropy)) in gradient
-            .chunks_exact_mut(width)
-            .zip(saved.chunks_exact(2 * width))
-            .zip(self.actions.chunks_exact(self.heads.count()))
-            .zip(d_log_probs.iter().zip(d_entropies))
+        for (((gradient, saved), actions), (d_log_probs, d_entropies)) in gradient
+            .chunks_mut(LANES * width)
+            .zip(saved.chunks_exact(width + components))
+            .zip(self.actions.chunks(LANES * components))
+            .zip(d_log_probs.chunks(LANES).zip(d_entropies.chunks(LANES)))
         {
-            let (log_probs, probs) = saved.split_at(width);
-            let mut at = 0;
-            for (&choice, &size) in action.iter().zip(self.heads.sizes()) {
-                let entropy = head_entropy(&log_probs[at..at + size], &probs[at..at + size]);
-                for j in at..at + size {
-                    gradient[j] = -probs[j] * (d_log_prob + d_entropy * (log_probs[j] + entropy));
+            let (log_probs, entropies) = saved.split_at(width);
+            let (d_log_prob, d_entropy) = (load(d_log_probs), load(d_entropies));
+            for ((at, size), entropy) in self.parts().zip(entropies) {
+                for (j, x) in log_probs[at..at + size].iter().enumerate() {
+                    let d = -exp_of_negative(*x) * (d_log_prob + d_entropy * (*x + *entropy));
+                    gradient[at + j..].iter_mut().step_by(width).zip(d.to_array()).for_each(|(out, d)| *out = d);
                 }
-                gradient[at + usize::from(choice)] += d_log_prob;
-                at += size;
+            }
+            let rows = gradient.chunks_exact_mut(width).zip(actions.chunks_exact(components)).zip(d_log_probs);
+            for ((gradient, action), d_log_prob) in rows {
+                for (&choice, (at, _)) in action.iter().zip(self.parts()) {
+                    gradient[at + usize::from(choice)] += d_log_prob;
+                }
             }
         }
         Ok([Some(gradient)])
     }
-}
-
-/// −Σ p ln p.
-fn head_entropy(log_probs: &[f32], probs: &[f32]) -> f32 {
-    -probs.iter().zip(log_probs).map(|(p, l)| p * l).sum::<f32>()
 }

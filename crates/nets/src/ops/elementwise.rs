@@ -13,6 +13,12 @@ pub fn tanh(x: &Tensor) -> Result<Tensor> {
     apply1(Elementwise::Tanh, x)
 }
 
+/// min(max(x, low), high) with derivative 1 between the bounds, which count as between: one operation, where candle takes thirty with
+/// the gradients of both bounds.
+pub fn clamp(x: &Tensor, low: f32, high: f32) -> Result<Tensor> {
+    apply1(Elementwise::Clamp(low, high), x)
+}
+
 /// Exponential linear unit: x above zero, eˣ − 1 elsewhere.
 pub fn elu(x: &Tensor) -> Result<Tensor> {
     apply1(Elementwise::Elu, x)
@@ -30,11 +36,12 @@ pub fn softmax(x: &Tensor) -> Result<Tensor> {
     exps.broadcast_div(&exps.sum_keepdim(D::Minus1)?)
 }
 
-/// A function whose derivative can be written in terms of its value.
+/// A function whose derivative can be written in terms of its value (and of x, for a clamp).
 enum Elementwise {
     Exp,
     Tanh,
     Elu,
+    Clamp(f32, f32),
 }
 
 impl Operation<1> for Elementwise {
@@ -42,12 +49,15 @@ impl Operation<1> for Elementwise {
 
     fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
         let mut y = vec![0.0; x.values.len()];
-        let f = match self {
-            Self::Exp | Self::Elu => f32x16::exp,
-            Self::Tanh => simd::tanh,
-        };
-        for (x, y) in x.values.chunks(LANES).zip(y.chunks_mut(LANES)) {
-            store(f(load(x)), y);
+        let chunks = x.values.chunks(LANES).zip(y.chunks_mut(LANES));
+        match self {
+            Self::Exp | Self::Elu => chunks.for_each(|(x, y)| store(load(x).exp(), y)),
+            Self::Tanh => chunks.for_each(|(x, y)| store(simd::tanh(load(x)), y)),
+            Self::Clamp(low, high) => {
+                // The bound first: of two operands the instruction gives the second one if one of them is NaN.
+                let (low, high) = (f32x16::splat(*low), f32x16::splat(*high));
+                chunks.for_each(|(x, y)| store(high.fast_min(low.fast_max(load(x))), y));
+            }
         }
         if matches!(self, Self::Elu) {
             y.iter_mut().zip(x.values).for_each(|(y, &x)| *y = if x > 0.0 { x } else { *y - 1.0 });
@@ -55,13 +65,14 @@ impl Operation<1> for Elementwise {
         Ok((y, Shape::from(x.dims)))
     }
 
-    fn backward(&self, _: [Arg<'_>; 1], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
-        let dx = y.iter().zip(dy).map(|(y, d)| match self {
-            Self::Exp => d * y,
-            Self::Tanh => d * (1.0 - y * y),
-            Self::Elu => d * if *y > 0.0 { 1.0 } else { y + 1.0 },
-        });
-        Ok([Some(dx.collect())])
+    fn backward(&self, [x]: [Arg<'_>; 1], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
+        let pairs = y.iter().zip(dy);
+        Ok([Some(match self {
+            Self::Exp => pairs.map(|(y, d)| d * y).collect(),
+            Self::Tanh => pairs.map(|(y, d)| d * (1.0 - y * y)).collect(),
+            Self::Elu => pairs.map(|(y, d)| d * if *y > 0.0 { 1.0 } else { y + 1.0 }).collect(),
+            Self::Clamp(..) => x.values.iter().zip(pairs).map(|(x, (y, d))| if x == y { *d } else { 0.0 }).collect(),
+        })])
     }
 }
 

@@ -1,7 +1,10 @@
+mod gradients;
+
+use super::buffer::Buffer;
 use super::operation::{Arg, Operation, apply3};
-use super::simd::{LANES, load, sigmoid, store, sum};
+use super::simd::{LANES, load, store};
 use candle_core::{Result, Shape, Tensor, bail};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use wide::f32x16;
 
 /// Where the Gumbel noise of a graph block comes from.
@@ -44,12 +47,24 @@ pub fn graph_block(
     block: GraphBlock,
     noise: GraphNoise,
 ) -> Result<Tensor> {
-    apply3(Op { block, noise }, [features, relative, score])
+    let keep = [features, relative, score].into_iter().any(Tensor::track_op);
+    apply3(Op { block, noise, keep, saved: OnceLock::new() }, [features, relative, score])
 }
 
 struct Op {
     block: GraphBlock,
     noise: GraphNoise,
+    /// Whether there will be a gradient.
+    keep: bool,
+    saved: OnceLock<Saved>,
+}
+
+/// What the gradient needs of the way there.
+struct Saved {
+    /// [S·N, padded] logits plus noise.
+    logits: Buffer,
+    /// [S·N, F] mean messages.
+    messages: Buffer,
 }
 
 /// Working memory of one joint state. `padded` is N rounded up to whole vectors.
@@ -59,20 +74,13 @@ struct Scratch {
     sender: Vec<f32>,
     /// [P, padded] v_j + q_j, transposed so that one vector holds sixteen neighbours.
     receiver: Vec<f32>,
-    /// `[padded]` logits plus noise of the current row.
-    logits: Vec<f32>,
 }
 
 impl Op {
     fn scratch(&self) -> Scratch {
         let padded = self.block.agents.div_ceil(LANES) * LANES;
         let p = self.block.pair_hidden;
-        Scratch {
-            padded,
-            sender: vec![0.0; self.block.agents * p],
-            receiver: vec![0.0; p * padded],
-            logits: vec![0.0; padded],
-        }
+        Scratch { padded, sender: vec![0.0; self.block.agents * p], receiver: vec![0.0; p * padded] }
     }
 
     fn columns(&self) -> usize {
@@ -92,21 +100,29 @@ impl Op {
 
     /// Logits plus noise of agent i towards all others, sixteen neighbours at a time.
     #[inline(always)]
-    fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &mut Scratch) {
+    fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &Scratch, logits: &mut [f32]) {
         // Several vectors at once hide the latency of the multiply-adds; each lane's sum has the same order either way.
         let mut v = 0;
         while v + 4 * LANES <= scratch.padded {
-            self.logits_of::<4>(state, i, v, score, scratch);
+            self.logits_of::<4>(state, i, v, score, scratch, logits);
             v += 4 * LANES;
         }
         while v < scratch.padded {
-            self.logits_of::<1>(state, i, v, score, scratch);
+            self.logits_of::<1>(state, i, v, score, scratch, logits);
             v += LANES;
         }
     }
 
     #[inline(always)]
-    fn logits_of<const Q: usize>(&self, state: usize, i: usize, v: usize, score: &[f32], scratch: &mut Scratch) {
+    fn logits_of<const Q: usize>(
+        &self,
+        state: usize,
+        i: usize,
+        v: usize,
+        score: &[f32],
+        scratch: &Scratch,
+        logits: &mut [f32],
+    ) {
         let (n, p, padded) = (self.block.agents, self.block.pair_hidden, scratch.padded);
         let sender = &scratch.sender[i * p..(i + 1) * p];
         let mut acc = [f32x16::splat(score[p]); Q];
@@ -124,17 +140,17 @@ impl Op {
                 let counter = (self.block.block << 27).wrapping_add((i * n + at) as u32);
                 acc += logistic(keys[state], counter);
             }
-            store(acc, &mut scratch.logits[at..]);
+            store(acc, &mut logits[at..]);
         }
     }
 
     /// Calls `f` for every present edge i → j, in ascending j. Returns the degree.
     #[inline(always)]
-    fn edges(&self, i: usize, scratch: &Scratch, mut f: impl FnMut(usize)) -> usize {
+    fn edges(&self, i: usize, logits: &[f32], mut f: impl FnMut(usize)) -> usize {
         let n = self.block.agents;
         let mut degree = 0;
-        for v in (0..scratch.padded).step_by(LANES) {
-            let mut mask = load(&scratch.logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
+        for v in (0..logits.len()).step_by(LANES) {
+            let mut mask = load(&logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
             if n - v < LANES {
                 mask &= (1 << (n - v)) - 1;
             }
@@ -152,14 +168,14 @@ impl Op {
 
     /// Mean message of agent i, and its divisor max(1, degree).
     #[inline(always)]
-    fn message(&self, i: usize, features: &[f32], scratch: &Scratch, message: &mut [f32]) -> usize {
+    fn message(&self, i: usize, features: &[f32], logits: &[f32], message: &mut [f32]) {
         let (columns, width) = (self.columns(), self.block.width);
         let z0 = 2 * self.block.pair_hidden;
         message.fill(0.0);
         let degree = if width == 2 * LANES {
             // The usual width, held in registers: the same sums in the same order as below.
             let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
-            let degree = self.edges(i, scratch, |j| {
+            let degree = self.edges(i, logits, |j| {
                 let z = &features[j * columns + z0..];
                 a += load(z);
                 b += load(&z[LANES..]);
@@ -168,7 +184,7 @@ impl Op {
             store(b, &mut message[LANES..]);
             degree
         } else {
-            self.edges(i, scratch, |j| {
+            self.edges(i, logits, |j| {
                 for (m, z) in message.iter_mut().zip(&features[j * columns + z0..]) {
                     *m += z;
                 }
@@ -178,7 +194,6 @@ impl Op {
         for m in message.iter_mut() {
             *m *= inverse;
         }
-        degree
     }
 
     fn aggregate(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
@@ -186,13 +201,18 @@ impl Op {
         let states = features.len() / (n * columns);
         let mut y = vec![0.0; states * n * width];
         let mut scratch = self.scratch();
-        let mut message = vec![0.0; width];
+        let padded = scratch.padded;
+        let kept = if self.keep { states * n } else { 1 };
+        let (mut logits, mut messages) = (Buffer::take(kept * padded), Buffer::take(kept * width));
         for s in 0..states {
             let features = &features[s * n * columns..(s + 1) * n * columns];
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
             for i in 0..n {
-                self.row_logits(s, i, score, &mut scratch);
-                self.message(i, features, &scratch, &mut message);
+                let row = if self.keep { s * n + i } else { 0 };
+                let logits = &mut logits[row * padded..(row + 1) * padded];
+                let message = &mut messages[row * width..(row + 1) * width];
+                self.row_logits(s, i, score, &scratch, logits);
+                self.message(i, features, logits, message);
                 let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
                 let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
                 for k in 0..width {
@@ -201,182 +221,12 @@ impl Op {
                 }
             }
         }
+        if self.keep {
+            // Each call of `graph_block` makes its own operation: the cell is empty.
+            let _ = self.saved.set(Saved { logits, messages });
+        }
         y
     }
-
-    /// Gradients of features, relative and score.
-    fn gradients(&self, features: &[f32], relative: &[f32], score: &[f32], y: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
-        let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
-        let states = features.len() / (n * columns);
-        let mut scratch = self.scratch();
-        let padded = scratch.padded;
-        let (mut all_d_features, mut d_relative) = (vec![0.0; features.len()], vec![0.0; relative.len()]);
-        let mut d_score = vec![f32x16::ZERO; p + 1];
-        let (mut z, mut d_z) = (vec![0.0; width * padded], vec![0.0; n * width]);
-        let mut d_receiver = vec![f32x16::ZERO; p * padded / LANES];
-        let (mut message, mut g) = (vec![0.0; width], vec![0.0; width]);
-        let inverse_temperature = f32x16::splat(1.0 / self.block.temperature);
-        let mut d_sender = vec![f32x16::ZERO; p];
-        for s in 0..states {
-            let features = &features[s * n * columns..(s + 1) * n * columns];
-            let d_features = &mut all_d_features[s * n * columns..(s + 1) * n * columns];
-            self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
-            for j in 0..n {
-                for k in 0..width {
-                    z[k * padded + j] = features[j * columns + 2 * p + k];
-                }
-            }
-            d_receiver.fill(f32x16::ZERO);
-            d_z.fill(0.0);
-            for i in 0..n {
-                self.row_logits(s, i, score, &mut scratch);
-                let degree = self.message(i, features, &scratch, &mut message);
-                let inverse = 1.0 / degree.max(1) as f32;
-                let at = (s * n + i) * width;
-                let mut through_mean = 0.0;
-                for k in 0..width {
-                    let d = if y[at + k] > 0.0 { dy[at + k] } else { 0.0 };
-                    if self.block.self_path {
-                        d_features[i * columns + 2 * p + width + k] = d;
-                    }
-                    g[k] = d * inverse;
-                    through_mean += g[k] * message[k];
-                }
-                self.edges(i, &scratch, |j| {
-                    for (d, g) in d_z[j * width..(j + 1) * width].iter_mut().zip(&g) {
-                        *d += g;
-                    }
-                });
-                if degree == 0 {
-                    through_mean = 0.0;
-                }
-                d_sender.fill(f32x16::ZERO);
-                let mut v = 0;
-                while v < padded {
-                    let row = Row { i, v, n, through_mean, inverse_temperature };
-                    if v + 4 * LANES <= padded {
-                        self.row_gradient::<4>(
-                            row,
-                            score,
-                            &scratch,
-                            &z,
-                            &g,
-                            &mut d_score,
-                            &mut d_sender,
-                            &mut d_receiver,
-                        );
-                        v += 4 * LANES;
-                    } else {
-                        self.row_gradient::<1>(
-                            row,
-                            score,
-                            &scratch,
-                            &z,
-                            &g,
-                            &mut d_score,
-                            &mut d_sender,
-                            &mut d_receiver,
-                        );
-                        v += LANES;
-                    }
-                }
-                for k in 0..p {
-                    let d = sum(d_sender[k]);
-                    d_features[i * columns + k] = d;
-                    d_relative[(s * n + i) * p + k] = -d;
-                }
-            }
-            for k in 0..p {
-                for v in (0..padded).step_by(LANES) {
-                    for (lane, d) in d_receiver[(k * padded + v) / LANES].to_array().into_iter().enumerate() {
-                        let j = v + lane;
-                        if j < n {
-                            d_features[j * columns + p + k] = d;
-                            d_relative[(s * n + j) * p + k] += d;
-                        }
-                    }
-                }
-            }
-            for j in 0..n {
-                d_features[j * columns + 2 * p..j * columns + 2 * p + width]
-                    .copy_from_slice(&d_z[j * width..(j + 1) * width]);
-            }
-        }
-        [all_d_features, d_relative, d_score.into_iter().map(sum).collect()]
-    }
-}
-
-/// Place of a few vectors of neighbours in the gradient of one agent's edges.
-#[derive(Clone, Copy)]
-struct Row {
-    i: usize,
-    v: usize,
-    n: usize,
-    through_mean: f32,
-    inverse_temperature: f32x16,
-}
-
-impl Op {
-    /// Gradient through the edges of agent `row.i` to Q vectors of neighbours.
-    #[allow(clippy::too_many_arguments)] // a kernel: its operands are its meaning
-    #[inline(always)]
-    fn row_gradient<const Q: usize>(
-        &self,
-        row: Row,
-        score: &[f32],
-        scratch: &Scratch,
-        z: &[f32],
-        g: &[f32],
-        d_score: &mut [f32x16],
-        d_sender: &mut [f32x16],
-        d_receiver: &mut [f32x16],
-    ) {
-        let (p, padded) = (self.block.pair_hidden, scratch.padded);
-        // d a_ij = g_i · (z_j − mean message), then through σ'((logit + noise) / τ).
-        let mut d_logit = [f32x16::splat(-row.through_mean); Q];
-        for (k, g) in g.iter().enumerate() {
-            let g = f32x16::splat(*g);
-            let z = &z[k * padded + row.v..k * padded + row.v + Q * LANES];
-            for (q, d) in d_logit.iter_mut().enumerate() {
-                *d = g.mul_add(load(&z[q * LANES..]), *d);
-            }
-        }
-        for (q, d) in d_logit.iter_mut().enumerate() {
-            let at = row.v + q * LANES;
-            let soft = sigmoid(load(&scratch.logits[at..]) * row.inverse_temperature);
-            let slope = soft * (f32x16::ONE - soft) * row.inverse_temperature;
-            *d = (*d * slope) & present(row.i, at, row.n);
-            d_score[p] += *d;
-        }
-        for k in 0..p {
-            let (u, w) = (f32x16::splat(scratch.sender[row.i * p + k]), f32x16::splat(score[k]));
-            let receiver = &scratch.receiver[k * padded + row.v..k * padded + row.v + Q * LANES];
-            let first = (k * padded + row.v) / LANES;
-            let d_receiver = &mut d_receiver[first..first + Q];
-            let (mut d_s, mut d_u) = (d_score[k], d_sender[k]);
-            for q in 0..Q {
-                let hidden = u + load(&receiver[q * LANES..]);
-                d_s = d_logit[q].mul_add(hidden.fast_max(f32x16::ZERO), d_s);
-                let d_hidden = (d_logit[q] * w) & hidden.simd_gt(f32x16::ZERO);
-                d_u += d_hidden;
-                d_receiver[q] += d_hidden;
-            }
-            d_score[k] = d_s;
-            d_sender[k] = d_u;
-        }
-    }
-}
-
-/// All-ones lanes for neighbours that exist and are not agent i itself.
-#[inline(always)]
-fn present(i: usize, v: usize, n: usize) -> f32x16 {
-    let mut lanes = [f32::from_bits(u32::MAX); LANES];
-    for (lane, slot) in lanes.iter_mut().enumerate() {
-        if v + lane >= n || v + lane == i {
-            *slot = 0.0;
-        }
-    }
-    f32x16::new(lanes)
 }
 
 /// Sixteen logistic numbers for counters `counter..counter + 16`.
@@ -389,7 +239,7 @@ fn logistic(key: u64, counter: u32) -> f32x16 {
         *slot = (bits as f32 + 0.5) * (1.0 / 8_388_608.0);
     }
     let u = f32x16::new(uniform);
-    u.ln() - (f32x16::ONE - u).ln()
+    (u / (f32x16::ONE - u)).ln()
 }
 
 impl Operation<3> for Op {
@@ -413,7 +263,7 @@ impl Operation<3> for Op {
     }
 
     fn backward(&self, args: [Arg<'_>; 3], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
-        let [features, relative, score] = args.map(|arg| arg.values);
-        Ok(self.gradients(features, relative, score, y, dy).map(Some))
+        let Some(saved) = self.saved.get() else { bail!("graph block: gradient without forward") };
+        Ok(self.gradients(saved, args.map(|arg| arg.values), y, dy).map(Some))
     }
 }

@@ -1,106 +1,184 @@
-use super::matmul::{Activation, Packed, matmul, weight_gradient};
+use super::buffer::Buffer;
+use super::gradient::Gradient;
+use super::matmul::{Activation, Packed, Rows, Start, layer};
 use super::operation::{Arg, Operation, apply3};
 use super::simd::{LANES, load, sigmoid, store, tanh};
 use candle_core::{Result, Shape, Tensor, bail};
-use std::sync::OnceLock;
+use std::ops::Range;
+use std::sync::{Arc, OnceLock};
 use wide::f32x16;
 
-/// Gated recurrent unit over a sequence, gates in the order reset, update, new (the convention of PyTorch).
-///
-/// `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `w` [H, 3H], `b` `[3H]`, `h0` [R·H] the state that enters the
-/// sequence (constant: the gradient is truncated there). Returns all states [L, R, H].
-pub fn gru(input: &Tensor, w: &Tensor, b: &Tensor, h0: Vec<f32>) -> Result<Tensor> {
-    apply3(Gru { h0, saved: OnceLock::new() }, [input, w, b])
+/// Gated recurrent unit of H units, gates in the order reset, update, new (the convention of PyTorch).
+#[derive(Clone)]
+pub struct Gru {
+    /// [H, 3H]
+    weight: Tensor,
+    /// `[3H]`
+    bias: Tensor,
+    packs: Arc<Packs>,
 }
 
-struct Gru {
+#[derive(Default)]
+struct Packs {
+    forward: OnceLock<Packed>,
+    backward: OnceLock<Packed>,
+}
+
+impl Gru {
+    /// With recurrent weights [H, 3H] and their bias `[3H]`.
+    pub fn new(weight: Tensor, bias: Tensor) -> Self {
+        Self { weight, bias, packs: Arc::default() }
+    }
+
+    /// Over a sequence: `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `h0` [R·H] the state that enters the sequence
+    /// (constant: the gradient is truncated there). Returns all states [L, R, H].
+    pub fn forward(&self, input: &Tensor, h0: Vec<f32>) -> Result<Tensor> {
+        let keep = [input, &self.weight, &self.bias].into_iter().any(Tensor::track_op);
+        let op = Op { h0, packs: self.packs.clone(), keep, saved: OnceLock::new() };
+        apply3(op, [input, &self.weight, &self.bias])
+    }
+}
+
+/// Rows that pass through all steps before the next ones do: their state stays in the first cache levels.
+const TILE: usize = 48;
+
+struct Op {
     h0: Vec<f32>,
-    /// [L, R, 4H]: reset, update, new, and h·W_n + b_n, for the gradient.
-    saved: OnceLock<Vec<f32>>,
+    packs: Arc<Packs>,
+    /// Whether there will be a gradient.
+    keep: bool,
+    /// [L, R, 4H]: reset, update, new, and h·W_n + b_n.
+    saved: OnceLock<Buffer>,
 }
 
-impl Operation<3> for Gru {
+/// L, R and H.
+fn sizes(x: &Arg<'_>) -> Result<(usize, usize, usize)> {
+    let [steps, rows, triple] = *x.dims else { bail!("gru: input {:?} is not [L, R, 3H]", x.dims) };
+    Ok((steps, rows, triple / 3))
+}
+
+fn tiles(rows: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..rows).step_by(TILE).map(move |from| from..rows.min(from + TILE))
+}
+
+impl Operation<3> for Op {
     const NAME: &'static str = "gru";
 
     fn forward(&self, [x, w, b]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
-        let [steps, rows, triple] = *x.dims else { bail!("gru: input {:?} is not [L, R, 3H]", x.dims) };
-        let hidden = triple / 3;
-        if hidden % LANES != 0 || w.dims != [hidden, triple] || self.h0.len() != rows * hidden {
+        let (steps, rows, hidden) = sizes(&x)?;
+        let triple = 3 * hidden;
+        if hidden % LANES != 0 || w.dims != [hidden, triple] || b.dims != [triple] || self.h0.len() != rows * hidden {
             bail!("gru: input {:?}, w {:?}, {} initial states do not fit", x.dims, w.dims, self.h0.len());
         }
-        let (x, w, b) = (x.values, Packed::new(w.values, hidden, triple), b.values);
+        let pack = self.packs.forward.get_or_init(|| Packed::new(w.values, hidden, triple));
         let mut states = vec![0.0; steps * rows * hidden];
-        let mut saved = vec![0.0; steps * rows * 4 * hidden];
-        let mut recurrent = vec![0.0; rows * triple];
-        let mut h = self.h0.clone();
-        for t in 0..steps {
-            matmul(&h, &w, Some(b), Activation::Identity, &mut recurrent);
-            for r in 0..rows {
-                let x = &x[(t * rows + r) * triple..][..triple];
-                let u = &recurrent[r * triple..][..triple];
-                let keep = &mut saved[(t * rows + r) * 4 * hidden..][..4 * hidden];
-                let h = &mut h[r * hidden..][..hidden];
-                for v in (0..hidden).step_by(LANES) {
-                    let reset = sigmoid(load(&x[v..]) + load(&u[v..]));
-                    let update = sigmoid(load(&x[hidden + v..]) + load(&u[hidden + v..]));
-                    let candidate = load(&u[2 * hidden + v..]);
-                    let new = tanh(reset.mul_add(candidate, load(&x[2 * hidden + v..])));
-                    let old = load(&h[v..]);
-                    store(update.mul_add(old - new, new), &mut h[v..]);
-                    store(reset, &mut keep[v..]);
-                    store(update, &mut keep[hidden + v..]);
-                    store(new, &mut keep[2 * hidden + v..]);
-                    store(candidate, &mut keep[3 * hidden + v..]);
+        let mut saved = Buffer::take(if self.keep { steps * rows * 4 * hidden } else { 4 * hidden });
+        let mut recurrent = Buffer::take(TILE.min(rows) * triple);
+        for tile in tiles(rows) {
+            for t in 0..steps {
+                let (before, now) = states.split_at_mut(t * rows * hidden);
+                let before = match t {
+                    0 => &self.h0[..],
+                    _ => &before[(t - 1) * rows * hidden..],
+                };
+                let old = Rows::new(&before[tile.start * hidden..tile.end * hidden], hidden);
+                let u = &mut recurrent[..tile.len() * triple];
+                layer(old, pack, Start::Bias(b.values), Activation::Identity, u, triple, tile.len());
+                for (r, u) in tile.clone().zip(u.chunks_exact(triple)) {
+                    let at = t * rows + r;
+                    let keep = if self.keep { at } else { 0 };
+                    gates(
+                        &x.values[at * triple..][..triple],
+                        u,
+                        &before[r * hidden..][..hidden],
+                        &mut now[r * hidden..][..hidden],
+                        &mut saved[keep * 4 * hidden..][..4 * hidden],
+                    );
                 }
             }
-            states[t * rows * hidden..(t + 1) * rows * hidden].copy_from_slice(&h);
         }
-        // A second forward through the same operation cannot happen: each call of `gru` makes its own.
-        let _ = self.saved.set(saved);
+        if self.keep {
+            // Each call of `forward` makes its own operation: the cell is empty.
+            let _ = self.saved.set(saved);
+        }
         Ok((states, Shape::from((steps, rows, hidden))))
     }
 
     fn backward(&self, [x, w, _]: [Arg<'_>; 3], states: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
-        let [steps, rows, triple] = *x.dims else { bail!("gru: input {:?} is not [L, R, 3H]", x.dims) };
-        let hidden = triple / 3;
+        let (steps, rows, hidden) = sizes(&x)?;
+        let triple = 3 * hidden;
         let Some(saved) = self.saved.get() else { bail!("gru: gradient without forward") };
-        let transposed = Packed::transposed(w.values, hidden, triple);
+        let transposed = self.packs.backward.get_or_init(|| Packed::transposed(w.values, hidden, triple));
         // Gradients of the input projections and of the recurrent projections; they differ in the new gate only.
         let mut dx = vec![0.0; steps * rows * triple];
-        let mut du = vec![0.0; steps * rows * triple];
-        let size = rows * hidden;
-        let (mut dh, mut back) = (vec![0.0; size], vec![0.0; size]);
-        let previous = [&self.h0[..], &states[..(steps - 1) * size]].concat();
-        for t in (0..steps).rev() {
-            for r in 0..rows {
-                let keep = &saved[(t * rows + r) * 4 * hidden..][..4 * hidden];
-                let at = (t * rows + r) * triple;
-                for v in (0..hidden).step_by(LANES) {
-                    let one = f32x16::ONE;
-                    let (reset, update) = (load(&keep[v..]), load(&keep[hidden + v..]));
-                    let (new, candidate) = (load(&keep[2 * hidden + v..]), load(&keep[3 * hidden + v..]));
-                    let old = load(&previous[(t * rows + r) * hidden + v..]);
-                    let d = load(&dh[r * hidden + v..]) + load(&dy[(t * rows + r) * hidden + v..]);
-                    let d_new = d * (one - update) * (one - new * new);
-                    let d_update = d * (old - new) * update * (one - update);
-                    let d_reset = d_new * candidate * reset * (one - reset);
-                    let d_candidate = d_new * reset;
-                    store(d_reset, &mut dx[at + v..]);
-                    store(d_update, &mut dx[at + hidden + v..]);
-                    store(d_new, &mut dx[at + 2 * hidden + v..at + triple]);
-                    store(d_reset, &mut du[at + v..]);
-                    store(d_update, &mut du[at + hidden + v..]);
-                    store(d_candidate, &mut du[at + 2 * hidden + v..at + triple]);
-                    store(d * update, &mut dh[r * hidden + v..]);
+        let mut du = Buffer::take(TILE.min(rows) * triple);
+        let mut dh = Buffer::take(TILE.min(rows) * hidden);
+        let mut gradient = Gradient::new(hidden, triple);
+        for tile in tiles(rows) {
+            let dh = &mut dh[..tile.len() * hidden];
+            dh.fill(0.0);
+            for t in (0..steps).rev() {
+                let before = match t {
+                    0 => &self.h0[..],
+                    _ => &states[(t - 1) * rows * hidden..],
+                };
+                let before = &before[tile.start * hidden..tile.end * hidden];
+                for (i, r) in tile.clone().enumerate() {
+                    let at = t * rows + r;
+                    gate_gradients(
+                        &saved[at * 4 * hidden..][..4 * hidden],
+                        &before[i * hidden..][..hidden],
+                        &dy[at * hidden..][..hidden],
+                        &mut dh[i * hidden..][..hidden],
+                        &mut dx[at * triple..][..triple],
+                        &mut du[i * triple..][..triple],
+                    );
                 }
-            }
-            let du = &du[t * rows * triple..(t + 1) * rows * triple];
-            matmul(du, &transposed, None, Activation::Identity, &mut back);
-            for (d, b) in dh.iter_mut().zip(&back) {
-                *d += b;
+                let du = Rows::new(&du[..tile.len() * triple], triple);
+                gradient.add(Rows::new(before, hidden), du, tile.len());
+                layer(du, transposed, Start::Output, Activation::Identity, dh, hidden, tile.len());
             }
         }
-        let (dw, db) = weight_gradient(&previous, &du, hidden, triple);
+        let (mut dw, mut db) = (vec![0.0; hidden * triple], vec![0.0; triple]);
+        gradient.write(&mut dw, Some(&mut db));
         Ok([Some(dx), Some(dw), Some(db)])
+    }
+}
+
+/// One row of one step: x and u [3H] are the projections of input and state.
+#[inline(always)]
+fn gates(x: &[f32], u: &[f32], old: &[f32], state: &mut [f32], keep: &mut [f32]) {
+    let hidden = old.len();
+    for v in (0..hidden).step_by(LANES) {
+        let reset = sigmoid(load(&x[v..]) + load(&u[v..]));
+        let update = sigmoid(load(&x[hidden + v..]) + load(&u[hidden + v..]));
+        let candidate = load(&u[2 * hidden + v..]);
+        let new = tanh(reset.mul_add(candidate, load(&x[2 * hidden + v..])));
+        store(update.mul_add(load(&old[v..]) - new, new), &mut state[v..]);
+        store(reset, &mut keep[v..]);
+        store(update, &mut keep[hidden + v..]);
+        store(new, &mut keep[2 * hidden + v..]);
+        store(candidate, &mut keep[3 * hidden + v..]);
+    }
+}
+
+/// The way back. `dh` holds the gradient that comes from the next step, and then what goes straight to the step before.
+#[inline(always)]
+fn gate_gradients(keep: &[f32], old: &[f32], dy: &[f32], dh: &mut [f32], dx: &mut [f32], du: &mut [f32]) {
+    let (hidden, one) = (old.len(), f32x16::ONE);
+    for v in (0..hidden).step_by(LANES) {
+        let (reset, update) = (load(&keep[v..]), load(&keep[hidden + v..]));
+        let (new, candidate) = (load(&keep[2 * hidden + v..]), load(&keep[3 * hidden + v..]));
+        let d = load(&dh[v..]) + load(&dy[v..]);
+        let d_new = d * (one - update) * (one - new * new);
+        let d_update = d * (load(&old[v..]) - new) * update * (one - update);
+        let d_reset = d_new * candidate * reset * (one - reset);
+        store(d_reset, &mut dx[v..]);
+        store(d_update, &mut dx[hidden + v..]);
+        store(d_new, &mut dx[2 * hidden + v..]);
+        store(d_reset, &mut du[v..]);
+        store(d_update, &mut du[hidden + v..]);
+        store(d_new * reset, &mut du[2 * hidden + v..]);
+        store(d * update, &mut dh[v..]);
     }
 }

@@ -3,8 +3,12 @@
 //! Every output is b + x₀w₀ + x₁w₁ + … accumulated in exactly this order with fused multiply-add. That is why the learner,
 //! which sees thousands of rows, gets the same bits as an actor, which sees a few hundred: the first importance ratio
 //! is exactly 1. The general-purpose `gemm` crate gives no such promise.
+//!
+//! A tile of outputs stays in registers: six rows of four vectors where there are thirty-two registers of sixteen lanes, six rows of
+//! one vector where there are sixteen of eight. Rows are written out by a macro, because the compiler keeps an array of accumulators
+//! in memory when it unrolls a loop over more than sixteen of them too late.
 
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
 /// What is applied to a layer's output.
@@ -29,26 +33,38 @@ impl Activation {
     }
 
     /// dz = dy · f'(z), written in terms of y = f(z).
-    pub(crate) fn backward(self, y: &[f32], dy: &[f32]) -> Vec<f32> {
-        let mut dz = dy.to_vec();
+    #[inline(always)]
+    pub(crate) fn slope(self, y: f32x16, dy: f32x16) -> f32x16 {
         match self {
-            Self::Identity => {}
-            Self::Relu => {
-                for (d, &y) in dz.iter_mut().zip(y) {
-                    *d = if y > 0.0 { *d } else { 0.0 };
-                }
-            }
-            Self::Tanh => {
-                for (d, &y) in dz.iter_mut().zip(y) {
-                    *d *= 1.0 - y * y;
-                }
-            }
+            Self::Identity => dy,
+            Self::Relu => y.simd_gt(f32x16::ZERO) & dy,
+            Self::Tanh => dy * (f32x16::ONE - y * y),
         }
-        dz
     }
 }
 
-/// Weights [k, n] cut into panels of up to four vectors of columns, filled up with zeros.
+/// Rows of numbers, `stride` apart.
+#[derive(Clone, Copy)]
+pub(crate) struct Rows<'a> {
+    pub(crate) values: &'a [f32],
+    pub(crate) stride: usize,
+}
+
+impl<'a> Rows<'a> {
+    pub(crate) fn new(values: &'a [f32], stride: usize) -> Self {
+        Self { values, stride }
+    }
+
+    /// From column `column` on.
+    pub(crate) fn from_column(self, column: usize) -> Self {
+        Self { values: &self.values[column..], ..self }
+    }
+}
+
+/// Vectors of a panel, at most.
+const PANEL: usize = if WIDE { 4 } else { 1 };
+
+/// Weights [k, n] cut into panels of up to [`PANEL`] vectors of columns, filled up with zeros.
 pub(crate) struct Packed {
     panels: Vec<(usize, Vec<f32x16>)>,
     rows: usize,
@@ -58,11 +74,16 @@ pub(crate) struct Packed {
 impl Packed {
     /// From row-major [rows, columns].
     pub(crate) fn new(w: &[f32], rows: usize, columns: usize) -> Self {
+        Self::of(w, rows, columns, PANEL)
+    }
+
+    /// With panels of up to `most` vectors: one, two or four.
+    fn of(w: &[f32], rows: usize, columns: usize, most: usize) -> Self {
         let mut panels = Vec::new();
         let mut start = 0;
         while start < columns {
             let left = (columns - start).div_ceil(LANES);
-            let q = if left >= 4 { 4 } else { left.min(2) };
+            let q = if left >= 4 { 4 } else { left.min(2) }.min(most);
             let mut panel = Vec::with_capacity(rows * q);
             for row in w.chunks_exact(columns) {
                 for v in 0..q {
@@ -88,186 +109,189 @@ impl Packed {
     }
 }
 
+/// What the sums of a product begin with.
+#[derive(Clone, Copy)]
+pub(crate) enum Start<'a> {
+    Zero,
+    /// `[n]`, the same for every row.
+    Bias(&'a [f32]),
+    /// What stands in the output.
+    Output,
+}
+
 /// y [m, n] = act(x [m, k] · w [k, n] + b `[n]`).
 pub(crate) fn matmul(x: &[f32], w: &Packed, bias: Option<&[f32]>, act: Activation, y: &mut [f32]) {
-    let n = w.columns;
-    let mut start = 0;
-    for (q, panel) in &w.panels {
-        match q {
-            4 => panel_rows::<4, 4>(x, panel, w.rows, bias, act, y, n, start),
-            2 => panel_rows::<8, 2>(x, panel, w.rows, bias, act, y, n, start),
-            _ => panel_rows::<8, 1>(x, panel, w.rows, bias, act, y, n, start),
-        }
-        start += q * LANES;
+    let rows = y.len().checked_div(w.columns).unwrap_or(0);
+    layer(Rows::new(x, w.rows), w, bias.map_or(Start::Zero, Start::Bias), act, y, w.columns, rows);
+}
+
+/// The same for rows that are apart, in x as in y.
+pub(crate) fn layer(
+    x: Rows<'_>,
+    w: &Packed,
+    start: Start<'_>,
+    act: Activation,
+    y: &mut [f32],
+    stride: usize,
+    rows: usize,
+) {
+    match act {
+        Activation::Identity => product(x, w, start, y, stride, rows, |z, _, _| z),
+        Activation::Relu => product(x, w, start, y, stride, rows, |z, _, _| Activation::Relu.apply(z)),
+        Activation::Tanh => product(x, w, start, y, stride, rows, |z, _, _| Activation::Tanh.apply(z)),
     }
 }
 
-#[allow(clippy::too_many_arguments)] // a kernel: its operands are its meaning
-#[inline(always)]
-fn panel_rows<const R: usize, const Q: usize>(
-    x: &[f32],
-    panel: &[f32x16],
-    k: usize,
-    bias: Option<&[f32]>,
-    act: Activation,
-    y: &mut [f32],
-    n: usize,
-    start: usize,
+/// dx = (dz · wᵀ) · f'(x), where x is what the activation of the layer below gave; `w` is packed transposed.
+pub(crate) fn backward(
+    dz: Rows<'_>,
+    w: &Packed,
+    (act, x): (Activation, Rows<'_>),
+    dx: &mut [f32],
+    stride: usize,
+    rows: usize,
 ) {
-    let mut init = [f32x16::ZERO; Q];
-    if let Some(bias) = bias {
-        for (v, slot) in init.iter_mut().enumerate() {
-            *slot = load(&bias[(start + v * LANES).min(n)..]);
+    let n = w.columns;
+    let at = |row: usize, column: usize| {
+        let from = row * x.stride + column;
+        load(&x.values[from..from + LANES.min(n - column)])
+    };
+    match act {
+        Activation::Identity => product(dz, w, Start::Zero, dx, stride, rows, |d, _, _| d),
+        Activation::Relu => {
+            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c| Activation::Relu.slope(at(r, c), d));
+        }
+        Activation::Tanh => {
+            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c| Activation::Tanh.slope(at(r, c), d));
         }
     }
-    let m = x.len().checked_div(k).unwrap_or(0);
-    let mut row = 0;
-    while row + R <= m {
-        tile::<R, Q>(&x[row * k..(row + R) * k], panel, k, &init, act, &mut y[row * n..(row + R) * n], n, start);
-        row += R;
+}
+
+/// `finish` gets a sum, its row and its first column.
+#[inline(always)]
+fn product(
+    x: Rows<'_>,
+    w: &Packed,
+    start: Start<'_>,
+    y: &mut [f32],
+    stride: usize,
+    rows: usize,
+    finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+) {
+    let mut column = 0;
+    for (q, panel) in &w.panels {
+        let place = Place { column, columns: w.columns, stride };
+        match q {
+            4 => panel_rows::<4>(x, panel.as_chunks().0, start, y, place, rows, finish),
+            2 => panel_rows::<2>(x, panel.as_chunks().0, start, y, place, rows, finish),
+            _ => panel_rows::<1>(x, panel.as_chunks().0, start, y, place, rows, finish),
+        }
+        column += q * LANES;
     }
-    while row < m {
-        tile::<1, Q>(&x[row * k..(row + 1) * k], panel, k, &init, act, &mut y[row * n..(row + 1) * n], n, start);
+}
+
+/// Where a panel's outputs go.
+#[derive(Clone, Copy)]
+struct Place {
+    column: usize,
+    columns: usize,
+    stride: usize,
+}
+
+#[inline(always)]
+fn panel_rows<const Q: usize>(
+    x: Rows<'_>,
+    panel: &[[f32x16; Q]],
+    start: Start<'_>,
+    y: &mut [f32],
+    place: Place,
+    rows: usize,
+    finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+) {
+    let mut row = 0;
+    let six = Q == 4 || !WIDE;
+    let high = if six { 6 } else { 8 };
+    while row + high <= rows {
+        if six {
+            tile6(x, panel, start, y, place, row, finish);
+        } else {
+            tile8(x, panel, start, y, place, row, finish);
+        }
+        row += high;
+    }
+    while row + 4 <= rows {
+        tile4(x, panel, start, y, place, row, finish);
+        row += 4;
+    }
+    while row < rows {
+        tile1(x, panel, start, y, place, row, finish);
         row += 1;
     }
 }
 
-#[allow(clippy::too_many_arguments)]
-#[inline(always)]
-fn tile<const R: usize, const Q: usize>(
-    x: &[f32],
-    panel: &[f32x16],
-    k: usize,
-    init: &[f32x16; Q],
-    act: Activation,
-    y: &mut [f32],
-    n: usize,
-    start: usize,
-) {
-    let mut acc = [*init; R];
-    // Slices of exactly k, so that the loop below needs no bounds checks.
-    let rows: [&[f32]; R] = std::array::from_fn(|r| &x[r * k..][..k]);
-    let panel = &panel[..k * Q];
-    for i in 0..k {
-        let w = &panel[i * Q..][..Q];
-        for (row, acc) in rows.iter().zip(&mut acc) {
-            let a = f32x16::splat(row[i]);
-            for v in 0..Q {
-                acc[v] = a.mul_add(w[v], acc[v]);
+macro_rules! tile {
+    ($name:ident, $rows:literal, $($r:literal)*) => {
+        #[inline(always)]
+        fn $name<const Q: usize>(
+            x: Rows<'_>,
+            panel: &[[f32x16; Q]],
+            start: Start<'_>,
+            y: &mut [f32],
+            place: Place,
+            row: usize,
+            finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+        ) {
+            let Place { column, columns, stride } = place;
+            let mut acc = [[f32x16::ZERO; Q]; $rows];
+            match start {
+                Start::Zero => {}
+                Start::Bias(bias) => {
+                    let bias: [f32x16; Q] =
+                        std::array::from_fn(|q| load(&bias[(column + q * LANES).min(columns)..columns]));
+                    acc = [bias; $rows];
+                }
+                Start::Output => {
+                    $(for q in 0..Q {
+                        let from = (column + q * LANES).min(columns);
+                        let at = (row + $r) * stride;
+                        acc[$r][q] = load(&y[at + from..at + columns]);
+                    })*
+                }
             }
-        }
-    }
-    for (r, acc) in acc.iter().enumerate() {
-        for (v, value) in acc.iter().enumerate() {
-            let from = (start + v * LANES).min(n);
-            let to = (from + LANES).min(n);
-            store(act.apply(*value), &mut y[r * n + from..r * n + to]);
-        }
-    }
-}
-
-/// dw [k, n] = xᵀ [k, m] · dz [m, n] and db `[n]` = Σ rows of dz, both summed over the rows in their order.
-pub(crate) fn weight_gradient(x: &[f32], dz: &[f32], k: usize, n: usize) -> (Vec<f32>, Vec<f32>) {
-    let vectors = n.div_ceil(LANES);
-    let rows = dz.len().checked_div(n).unwrap_or(0);
-    let mut dw = vec![f32x16::ZERO; k * vectors];
-    let mut db = vec![f32x16::ZERO; vectors];
-    // A block of rows stays in the first cache levels while all of dw passes over it.
-    const BLOCK: usize = 128;
-    let mut padded = vec![f32x16::ZERO; BLOCK * vectors];
-    let mut first = 0;
-    while first < rows {
-        let count = BLOCK.min(rows - first);
-        for r in 0..count {
-            let row = &dz[(first + r) * n..(first + r + 1) * n];
-            for v in 0..vectors {
-                padded[r * vectors + v] = load(&row[v * LANES..]);
-                db[v] += padded[r * vectors + v];
+            // Slices of exactly k, so that the loop below needs no bounds checks.
+            let k = panel.len();
+            let rows: [&[f32]; $rows] = [$(&x.values[(row + $r) * x.stride..][..k]),*];
+            for (i, w) in panel.iter().enumerate() {
+                $(
+                    let a = f32x16::splat(rows[$r][i]);
+                    for q in 0..Q {
+                        acc[$r][q] = a.mul_add(w[q], acc[$r][q]);
+                    }
+                )*
             }
+            $(
+                let at = (row + $r) * stride;
+                for q in 0..Q {
+                    let from = column + q * LANES;
+                    if from < columns {
+                        let to = (from + LANES).min(columns);
+                        store(finish(acc[$r][q], row + $r, from), &mut y[at + from..at + to]);
+                    }
+                }
+            )*
         }
-        let block = &padded[..count * vectors];
-        let x = &x[first * k..(first + count) * k];
-        let mut v = 0;
-        while v < vectors {
-            let left = vectors - v;
-            if left >= 4 {
-                gradient_columns::<4, 4>(x, block, k, vectors, v, &mut dw);
-                v += 4;
-            } else if left >= 2 {
-                gradient_columns::<8, 2>(x, block, k, vectors, v, &mut dw);
-                v += 2;
-            } else {
-                gradient_columns::<8, 1>(x, block, k, vectors, v, &mut dw);
-                v += 1;
-            }
-        }
-        first += count;
-    }
-    let flatten = |data: &[f32x16], rows: usize| {
-        let mut out = vec![0.0; rows * n];
-        for r in 0..rows {
-            for v in 0..vectors {
-                let to = n.min((v + 1) * LANES);
-                store(data[r * vectors + v], &mut out[r * n + v * LANES..r * n + to]);
-            }
-        }
-        out
     };
-    (flatten(&dw, k), flatten(&db, 1))
 }
 
-#[inline(always)]
-fn gradient_columns<const R: usize, const Q: usize>(
-    x: &[f32],
-    block: &[f32x16],
-    k: usize,
-    vectors: usize,
-    v0: usize,
-    dw: &mut [f32x16],
-) {
-    let mut i = 0;
-    while i + R <= k {
-        gradient_tile::<R, Q>(x, block, k, vectors, v0, i, dw);
-        i += R;
-    }
-    while i < k {
-        gradient_tile::<1, Q>(x, block, k, vectors, v0, i, dw);
-        i += 1;
-    }
-}
-
-#[inline(always)]
-fn gradient_tile<const R: usize, const Q: usize>(
-    x: &[f32],
-    block: &[f32x16],
-    k: usize,
-    vectors: usize,
-    v0: usize,
-    i: usize,
-    dw: &mut [f32x16],
-) {
-    let mut acc = [[f32x16::ZERO; Q]; R];
-    for (r, acc) in acc.iter_mut().enumerate() {
-        acc.copy_from_slice(&dw[(i + r) * vectors + v0..(i + r) * vectors + v0 + Q]);
-    }
-    for (x, dz) in x.chunks_exact(k).zip(block.chunks_exact(vectors)) {
-        let x = &x[i..i + R];
-        let dz = &dz[v0..v0 + Q];
-        for (r, acc) in acc.iter_mut().enumerate() {
-            let a = f32x16::splat(x[r]);
-            for v in 0..Q {
-                acc[v] = a.mul_add(dz[v], acc[v]);
-            }
-        }
-    }
-    for (r, acc) in acc.iter().enumerate() {
-        dw[(i + r) * vectors + v0..(i + r) * vectors + v0 + Q].copy_from_slice(acc);
-    }
-}
+tile!(tile1, 1, 0);
+tile!(tile4, 4, 0 1 2 3);
+tile!(tile6, 6, 0 1 2 3 4 5);
+tile!(tile8, 8, 0 1 2 3 4 5 6 7);
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ops::gradient::Gradient;
     use magex_core::rng::{Key, Purpose};
 
     fn numbers(n: usize, tag: u32) -> Vec<f32> {
@@ -277,12 +301,32 @@ mod tests {
 
     #[test]
     fn products_match_double_precision_for_odd_sizes() {
-        for (m, k, n) in [(1, 1, 1), (7, 3, 5), (13, 36, 96), (9, 32, 33), (200, 9, 32), (64, 96, 64), (5, 17, 130)] {
+        for (m, k, n) in [
+            (1, 1, 1),
+            (7, 3, 5),
+            (13, 36, 96),
+            (9, 32, 33),
+            (200, 9, 32),
+            (64, 96, 64),
+            (5, 17, 130),
+            (70, 64, 5),
+            (70, 32, 1),
+            (40, 64, 192),
+        ] {
             let (x, w, b) = (numbers(m * k, 1), numbers(k * n, 2), numbers(n, 3));
             let mut y = vec![0.0; m * n];
             matmul(&x, &Packed::new(&w, k, n), Some(&b), Activation::Identity, &mut y);
             let dz = numbers(m * n, 4);
-            let (dw, db) = weight_gradient(&x, &dz, k, n);
+            let padded = n.next_multiple_of(LANES);
+            let mut wide = vec![0.0; m * padded];
+            wide.chunks_exact_mut(padded).zip(dz.chunks_exact(n)).for_each(|(to, from)| to[..n].copy_from_slice(from));
+            let mut gradient = Gradient::new(k, n);
+            // In two goes: the order of the sums does not depend on it.
+            let first = m / 3;
+            gradient.add(Rows::new(&x, k), Rows::new(&wide, padded), first);
+            gradient.add(Rows::new(&x[first * k..], k), Rows::new(&wide[first * padded..], padded), m - first);
+            let (mut dw, mut db) = (vec![0.0; k * n], vec![0.0; n]);
+            gradient.write(&mut dw, Some(&mut db));
             let mut dx = vec![0.0; m * k];
             matmul(&dz, &Packed::transposed(&w, k, n), None, Activation::Identity, &mut dx);
             let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-4 * (1.0 + b.abs());
@@ -305,6 +349,19 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// What another instruction set would do.
+    #[test]
+    fn the_width_of_a_panel_does_not_change_a_bit() {
+        let (m, k, n) = (101, 36, 119);
+        let (x, w, b) = (numbers(m * k, 1), numbers(k * n, 2), numbers(n, 3));
+        let product = |most: usize| {
+            let mut y = vec![0.0; m * n];
+            matmul(&x, &Packed::of(&w, k, n, most), Some(&b), Activation::Tanh, &mut y);
+            y
+        };
+        assert!(product(1) == product(4) && product(2) == product(4));
     }
 
     #[test]

@@ -1,3 +1,4 @@
+use super::matmul::Rows;
 use super::operation::{Arg, Operation, apply3};
 use super::simd::{LANES, load, store, sum};
 use candle_core::{Result, Shape, Tensor, bail};
@@ -10,14 +11,23 @@ pub fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> 
 
 /// The same for rows [R, n] of plain numbers, with the same bits.
 pub(crate) fn layer_norm_in_place(x: &mut [f32], scale: &[f32], shift: &[f32]) {
+    let mut y = vec![0.0; scale.len()];
+    for row in x.chunks_exact_mut(scale.len()) {
+        normalise(row, scale, shift, &mut y);
+        row.copy_from_slice(&y);
+    }
+}
+
+/// The same from rows x to rows y.
+pub(crate) fn normalise(x: &[f32], scale: &[f32], shift: &[f32], y: &mut [f32]) {
     let n = scale.len();
-    for row in x.chunks_exact_mut(n) {
+    for (row, out) in x.chunks_exact(n).zip(y.chunks_exact_mut(n)) {
         let (mean, inverse) = moments(row);
         let inverse = f32x16::splat(inverse);
         for i in (0..n).step_by(LANES) {
             let to = n.min(i + LANES);
             let normal = centred(&row[i..to], mean) * inverse;
-            store(normal.mul_add(load(&scale[i..to]), load(&shift[i..to])), &mut row[i..to]);
+            store(normal.mul_add(load(&scale[i..to]), load(&shift[i..to])), &mut out[i..to]);
         }
     }
 }
@@ -64,18 +74,40 @@ impl Operation<3> for LayerNorm {
         if scale.dims != [n] || shift.dims != [n] {
             bail!("layer norm: scale and shift must have {n} entries");
         }
-        let (shape, x, scale, shift) = (Shape::from(x.dims), x.values, scale.values, shift.values);
-        let mut y = x.to_vec();
-        layer_norm_in_place(&mut y, scale, shift);
-        Ok((y, shape))
+        let mut y = vec![0.0; x.values.len()];
+        normalise(x.values, scale.values, shift.values, &mut y);
+        Ok((y, Shape::from(x.dims)))
     }
 
     fn backward(&self, [x, gains, _]: [Arg<'_>; 3], _y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
         let (x, gains, n) = (x.values, gains.values, gains.values.len());
         let mut dx = vec![0.0; x.len()];
+        let mut gradient = NormGradient::new(n);
+        gradient.add(x, gains, Rows::new(dy, n), &mut dx, n);
+        let (mut ds, mut db) = (vec![0.0; n], vec![0.0; n]);
+        gradient.write(&mut ds, &mut db);
+        Ok([Some(dx), Some(ds), Some(db)])
+    }
+}
+
+/// Sums of the gradients of scale and shift.
+pub(crate) struct NormGradient {
+    scale: Vec<f32x16>,
+    shift: Vec<f32x16>,
+}
+
+impl NormGradient {
+    /// Of rows of n numbers, zero.
+    pub(crate) fn new(n: usize) -> Self {
+        let zeros = || vec![f32x16::ZERO; n.div_ceil(LANES)];
+        Self { scale: zeros(), shift: zeros() }
+    }
+
+    /// Takes in rows x [rows, n] and dy; writes dx in rows that are `stride` apart.
+    pub(crate) fn add(&mut self, x: &[f32], gains: &[f32], dy: Rows<'_>, dx: &mut [f32], stride: usize) {
+        let n = gains.len();
         let vectors = n.div_ceil(LANES);
-        let (mut ds, mut db) = (vec![f32x16::ZERO; vectors], vec![f32x16::ZERO; vectors]);
-        for ((row, dy), dx) in x.chunks_exact(n).zip(dy.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
+        for ((row, dy), dx) in x.chunks_exact(n).zip(dy.values.chunks(dy.stride)).zip(dx.chunks_mut(stride)) {
             let (mean, inverse) = moments(row);
             let spread = f32x16::splat(inverse);
             let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
@@ -86,8 +118,8 @@ impl Operation<3> for LayerNorm {
                 let g = d * load(&gains[from..to]);
                 a += g;
                 b = g.mul_add(normal, b);
-                ds[v] = d.mul_add(normal, ds[v]);
-                db[v] += d;
+                self.scale[v] = d.mul_add(normal, self.scale[v]);
+                self.shift[v] += d;
             }
             let (a, b) = (f32x16::splat(sum(a) / n as f32), f32x16::splat(sum(b) / n as f32));
             for v in 0..vectors {
@@ -97,7 +129,12 @@ impl Operation<3> for LayerNorm {
                 store(spread * (g - a - normal * b), &mut dx[from..to]);
             }
         }
-        let flat = |data: Vec<f32x16>| data.iter().flat_map(|v| v.to_array()).take(n).collect();
-        Ok([Some(dx), Some(flat(ds)), Some(flat(db))])
+    }
+
+    /// Writes the gradients of scale and shift `[n]`.
+    pub(crate) fn write(&self, scale: &mut [f32], shift: &mut [f32]) {
+        for (sums, out) in [(&self.scale, scale), (&self.shift, shift)] {
+            sums.iter().zip(out.chunks_mut(LANES)).for_each(|(sum, out)| store(*sum, out));
+        }
     }
 }

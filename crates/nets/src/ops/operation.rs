@@ -1,6 +1,6 @@
 //! Custom operations of candle in terms of slices.
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
 
 /// A contiguous argument of an operation.
 #[derive(Clone, Copy, Default)]
@@ -48,6 +48,11 @@ pub(super) fn apply1(operation: impl Operation<1>, x: &Tensor) -> Result<Tensor>
     x.contiguous()?.apply_op1(Custom(operation))
 }
 
+/// The same for two arguments.
+pub(super) fn apply2(operation: impl Operation<2>, [x, b]: [&Tensor; 2]) -> Result<Tensor> {
+    x.contiguous()?.apply_op2(b, Custom(operation))
+}
+
 /// The same for three arguments.
 pub(super) fn apply3(operation: impl Operation<3>, [x, b, c]: [&Tensor; 3]) -> Result<Tensor> {
     x.contiguous()?.apply_op3(b, c, Custom(operation))
@@ -69,6 +74,21 @@ impl<O: Operation<1>> CustomOp1 for Custom<O> {
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let [dx] = gradients(&self.0, [x], y, dy)?;
         Ok(dx)
+    }
+}
+
+impl<O: Operation<2>> CustomOp2 for Custom<O> {
+    fn name(&self) -> &'static str {
+        O::NAME
+    }
+
+    fn cpu_fwd(&self, a: &CpuStorage, la: &Layout, b: &CpuStorage, lb: &Layout) -> Result<(CpuStorage, Shape)> {
+        let (y, shape) = self.0.forward([Arg::of(a, la)?, Arg::of(b, lb)?])?;
+        Ok((CpuStorage::F32(y), shape))
+    }
+
+    fn bwd(&self, a: &Tensor, b: &Tensor, y: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        Ok(gradients(&self.0, [a, b], y, dy)?.into())
     }
 }
 

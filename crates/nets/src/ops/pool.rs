@@ -1,5 +1,5 @@
 use super::operation::{Arg, Operation, apply1, apply3};
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, WIDE, load, store};
 use candle_core::{Result, Shape, Tensor, bail};
 use wide::f32x16;
 
@@ -78,60 +78,197 @@ impl Operation<3> for NeighbourPool {
                 features.dims
             );
         }
-        let (w, b) = (w.values, b.values);
-        let mut y = vec![0.0; self.counts.len() * width];
-        for start in (0..width).step_by(LANES) {
-            let end = (start + LANES).min(width);
-            let columns: Vec<f32x16> = w.chunks_exact(width).map(|row| load(&row[start..end])).collect();
-            let bias = load(&b[start..end]);
-            let stride = neighbours * channels;
-            for ((f, &count), y) in
-                features.values.chunks_exact(stride).zip(self.counts.iter()).zip(y.chunks_exact_mut(width))
-            {
-                let mut total = f32x16::ZERO;
-                for f in f.chunks_exact(channels).take(count.into()) {
-                    let mut z = bias;
-                    for (f, column) in f.iter().zip(&columns) {
-                        z = f32x16::splat(*f).mul_add(*column, z);
-                    }
-                    total += z.fast_max(f32x16::ZERO);
-                }
-                store(total, &mut y[start..end]);
-            }
-        }
+        let mut y = vec![0.0; rows * width];
+        let weights = PoolWeights::new(w.values, b.values, neighbours * channels);
+        weights.forward(features.values, &self.counts, &mut y, width);
         Ok((y, Shape::from((rows, width))))
     }
 
     fn backward(&self, [features, w, b]: [Arg<'_>; 3], _y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
         let ((channels, width), stride) = (w.rows(), features.rows().1 * features.dims[1]);
-        let (w, b) = (w.values, b.values);
+        let weights = PoolWeights::new(w.values, b.values, stride);
+        let mut gradient = PoolGradient::new(&weights);
+        weights.backward(features.values, &self.counts, dy, width, &mut gradient);
         let (mut dw, mut db) = (vec![0.0; channels * width], vec![0.0; width]);
-        for start in (0..width).step_by(LANES) {
-            let end = (start + LANES).min(width);
-            let columns: Vec<f32x16> = w.chunks_exact(width).map(|row| load(&row[start..end])).collect();
-            let bias = load(&b[start..end]);
-            let (mut gw, mut gb) = (vec![f32x16::ZERO; channels], f32x16::ZERO);
-            for ((f, &count), dy) in
-                features.values.chunks_exact(stride).zip(self.counts.iter()).zip(dy.chunks_exact(width))
-            {
-                let dy = load(&dy[start..end]);
-                for f in f.chunks_exact(channels).take(count.into()) {
-                    let mut z = bias;
-                    for (f, column) in f.iter().zip(&columns) {
-                        z = f32x16::splat(*f).mul_add(*column, z);
-                    }
-                    let dz = z.simd_gt(f32x16::ZERO) & dy;
-                    gb += dz;
-                    for (f, g) in f.iter().zip(&mut gw) {
-                        *g = f32x16::splat(*f).mul_add(dz, *g);
-                    }
-                }
-            }
-            for (g, row) in gw.iter().zip(dw.chunks_exact_mut(width)) {
-                store(*g, &mut row[start..end]);
-            }
-            store(gb, &mut db[start..end]);
-        }
+        gradient.write(&mut dw, &mut db);
         Ok([None, Some(dw), Some(db)])
     }
 }
+
+/// Weights of a pool, cut into columns of two vectors.
+pub(crate) struct PoolWeights {
+    /// [h / 32, c + 1] two vectors each; the bias comes last.
+    panels: Vec<Vec<Pair>>,
+    channels: usize,
+    width: usize,
+    /// k · c: numbers of one agent.
+    stride: usize,
+}
+
+type Pair = [f32x16; 2];
+
+fn pair(row: &[f32], start: usize) -> Pair {
+    let at = |start: usize| load(&row[start.min(row.len())..]);
+    [at(start), at(start + LANES)]
+}
+
+fn put(pair: Pair, row: &mut [f32], start: usize) {
+    let end = row.len();
+    for (v, value) in pair.into_iter().enumerate() {
+        let from = (start + v * LANES).min(end);
+        store(value, &mut row[from..end.min(from + LANES)]);
+    }
+}
+
+impl PoolWeights {
+    /// Of w [c, h] and b `[h]`; `stride` numbers stand for one agent.
+    pub(crate) fn new(w: &[f32], b: &[f32], stride: usize) -> Self {
+        let width = b.len();
+        let panel = |start| w.chunks_exact(width).chain([b]).map(|row| pair(row, start)).collect();
+        let panels = (0..width).step_by(2 * LANES).map(panel).collect();
+        Self { panels, channels: w.len() / width.max(1), width, stride }
+    }
+
+    /// Writes the pools of all agents into rows of y that are `stride` apart.
+    pub(crate) fn forward(&self, features: &[f32], counts: &[u8], y: &mut [f32], stride: usize) {
+        for (index, panel) in self.panels.iter().enumerate() {
+            for ((f, &count), y) in features.chunks_exact(self.stride).zip(counts).zip(y.chunks_mut(stride)) {
+                let mut total = [f32x16::ZERO; 2];
+                self.neighbours(f, count, |f, group| {
+                    group.hidden(f, panel, self.channels, |z| {
+                        for v in 0..2 {
+                            total[v] += z[v].fast_max(f32x16::ZERO);
+                        }
+                    });
+                });
+                put(total, &mut y[..self.width], index * 2 * LANES);
+            }
+        }
+    }
+
+    /// Adds to the gradient of the weights, given that of the pools in rows that are `stride` apart.
+    pub(crate) fn backward(
+        &self,
+        features: &[f32],
+        counts: &[u8],
+        dy: &[f32],
+        stride: usize,
+        gradient: &mut PoolGradient,
+    ) {
+        for ((index, panel), sums) in self.panels.iter().enumerate().zip(&mut gradient.panels) {
+            for ((f, &count), dy) in features.chunks_exact(self.stride).zip(counts).zip(dy.chunks(stride)) {
+                let dy = pair(&dy[..self.width], index * 2 * LANES);
+                self.neighbours(f, count, |f, group| {
+                    let (mut dz, mut at) = ([[f32x16::ZERO; 2]; 4], 0);
+                    group.hidden(f, panel, self.channels, |z| {
+                        dz[at] = [z[0].simd_gt(f32x16::ZERO) & dy[0], z[1].simd_gt(f32x16::ZERO) & dy[1]];
+                        at += 1;
+                    });
+                    group.gradient(f, self.channels, &dz, sums);
+                });
+            }
+        }
+    }
+
+    /// Calls `f` for the real neighbours of an agent in their order, in groups of four (where there are registers for them), two and
+    /// one.
+    #[inline(always)]
+    fn neighbours(&self, features: &[f32], count: u8, mut f: impl FnMut(&[f32], Group)) {
+        let (mut left, mut features) = (usize::from(count), features);
+        let first = if WIDE { (4, Group::Four) } else { (2, Group::Two) };
+        for (size, group) in [first, (2, Group::Two), (1, Group::One)] {
+            while left >= size {
+                f(&features[..size * self.channels], group);
+                features = &features[size * self.channels..];
+                left -= size;
+            }
+        }
+    }
+}
+
+/// Sums of the gradient of [`PoolWeights`].
+pub(crate) struct PoolGradient {
+    panels: Vec<Vec<Pair>>,
+    width: usize,
+}
+
+impl PoolGradient {
+    pub(crate) fn new(weights: &PoolWeights) -> Self {
+        let zeros = |panel: &Vec<Pair>| vec![[f32x16::ZERO; 2]; panel.len()];
+        Self { panels: weights.panels.iter().map(zeros).collect(), width: weights.width }
+    }
+
+    /// Writes dw [c, h] and db `[h]`.
+    pub(crate) fn write(&self, dw: &mut [f32], db: &mut [f32]) {
+        for (index, panel) in self.panels.iter().enumerate() {
+            let rows = dw.chunks_exact_mut(self.width).chain([db as &mut [f32]]);
+            rows.zip(panel).for_each(|(row, sum)| put(*sum, row, index * 2 * LANES));
+        }
+    }
+}
+
+/// How many neighbours are in registers at once.
+#[derive(Clone, Copy)]
+enum Group {
+    Four,
+    Two,
+    One,
+}
+
+impl Group {
+    /// Calls `f` with f · w + b of each neighbour in turn.
+    #[inline(always)]
+    fn hidden(self, features: &[f32], panel: &[Pair], channels: usize, f: impl FnMut(Pair)) {
+        match self {
+            Self::Four => hidden4(features, panel, channels, f),
+            Self::Two => hidden2(features, panel, channels, f),
+            Self::One => hidden1(features, panel, channels, f),
+        }
+    }
+
+    /// Adds the neighbours' features times their dz to the sums.
+    #[inline(always)]
+    fn gradient(self, features: &[f32], channels: usize, dz: &[Pair; 4], sums: &mut [Pair]) {
+        match self {
+            Self::Four => gradient4(features, channels, dz, sums),
+            Self::Two => gradient2(features, channels, dz, sums),
+            Self::One => gradient1(features, channels, dz, sums),
+        }
+    }
+}
+
+macro_rules! group {
+    ($hidden:ident, $gradient:ident, $size:literal, $($r:literal)*) => {
+        #[inline(always)]
+        fn $hidden(features: &[f32], panel: &[Pair], channels: usize, mut f: impl FnMut(Pair)) {
+            let rows: [&[f32]; $size] = [$(&features[$r * channels..][..channels]),*];
+            let mut z = [panel[channels]; $size];
+            for (c, w) in panel[..channels].iter().enumerate() {
+                $(
+                    let a = f32x16::splat(rows[$r][c]);
+                    z[$r] = [a.mul_add(w[0], z[$r][0]), a.mul_add(w[1], z[$r][1])];
+                )*
+            }
+            $(f(z[$r]);)*
+        }
+
+        #[inline(always)]
+        fn $gradient(features: &[f32], channels: usize, dz: &[Pair; 4], sums: &mut [Pair]) {
+            let rows: [&[f32]; $size] = [$(&features[$r * channels..][..channels]),*];
+            let (sums, rest) = sums.split_at_mut(channels);
+            for (c, sum) in sums.iter_mut().enumerate() {
+                $(
+                    let a = f32x16::splat(rows[$r][c]);
+                    *sum = [a.mul_add(dz[$r][0], sum[0]), a.mul_add(dz[$r][1], sum[1])];
+                )*
+            }
+            if let Some(bias) = rest.first_mut() {
+                $(*bias = [bias[0] + dz[$r][0], bias[1] + dz[$r][1]];)*
+            }
+        }
+    };
+}
+
+group!(hidden1, gradient1, 1, 0);
+group!(hidden2, gradient2, 2, 0 1);
+group!(hidden4, gradient4, 4, 0 1 2 3);

@@ -138,3 +138,48 @@ fn only_an_agent_that_is_told_what_the_one_before_it_does_can_copy_it() {
     assert!(mat > 0.9, "MAT copies {mat}");
     assert!(mat_dec < 0.4, "MAT-Dec copies {mat_dec}, chance is 0.2");
 }
+
+/// A trajectory of agents anywhere, with the log-probabilities that the networks give.
+fn anywhere(mappo: &Mappo, learned: &Learned, episodes: u32) -> Batch {
+    let mut t = crate::fixtures::trajectory(&mappo.config.task, crate::fixtures::train_shard(0, 0, episodes));
+    let s = t.shape;
+    let mut stream = Key::new(6, Purpose::Bench, &[]).stream();
+    let mut numbers = |count: usize| (0..count).map(|_| stream.normal() as f32).collect::<Vec<f32>>();
+    t.positions = numbers((s.steps + 1) * s.episodes * s.bodies * s.dims);
+    t.velocities = numbers(t.positions.len());
+    t.rewards = numbers(s.steps * s.episodes * s.agents);
+    t.statics =
+        magex_core::statics::Statics::landmarks(s.landmarks, s.dims, numbers(s.episodes * s.landmarks * s.dims));
+    t.actions = numbers(s.steps * s.episodes * s.agents).iter().map(|x| (x.abs() * 10.0) as u8 % 5).collect();
+    let mut batch = Batch::new(1, mappo.spec(), &[t]);
+    batch.log_probs = mappo.log_probs(learned, &batch).unwrap();
+    batch
+}
+
+#[test]
+fn threads_do_not_reach_a_number_and_the_first_ratio_is_exactly_one() {
+    use magex_core::config::ExecutorKind::{Flat, Local, Magex};
+    use magex_core::task::{RewardTarget, Spawn, TaskConfig};
+    for (kind, recurrent) in [(Local, false), (Magex, false), (Flat, false), (Flat, true)] {
+        let reward_target = if kind == Flat { RewardTarget::Team } else { RewardTarget::Goals };
+        let task = TaskConfig { horizon: 20, reward_target, ..TaskConfig::simple_spread(7, Spawn::Uniform) };
+        let mut config = RunConfig { task, ..RunConfig::default() };
+        (config.executor.kind, config.executor.recurrent) = (kind, recurrent);
+        (config.mappo.minibatch_size, config.mappo.chunk_length) = (280, 5);
+        config.collect.shards_per_iteration = 1;
+        config.collect.episodes_per_iteration = 6;
+        let mappo = Mappo::new(&config.validated().unwrap()).unwrap();
+        let fresh = || Learned { networks: mappo.init().unwrap(), value_norm: mappo.value_norm(), replay: None };
+        let batch = anywhere(&mappo, &fresh(), 6);
+        let run = |threads: usize| {
+            let mut learned = fresh();
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).stack_size(64 << 20).build().unwrap();
+            let stats = pool.install(|| mappo.update(&mut learned, &batch, 0, 0.0)).unwrap();
+            (learned, format!("{stats:?}"))
+        };
+        let (one, stats) = run(1);
+        assert!(one != fresh(), "{kind}: nothing was learned");
+        assert!((one, stats.clone()) == run(2), "{kind}, recurrent {recurrent}: two threads give other bits");
+        assert!(stats.contains("(\"first_ratio_error\", 0.0)"), "{kind}, recurrent {recurrent}: {stats}");
+    }
+}

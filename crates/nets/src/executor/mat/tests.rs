@@ -8,6 +8,7 @@ use magex_core::joint_state::JointState;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{RewardTarget, Spawn, TaskConfig};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Samples from one stream and keeps what it chose.
@@ -51,7 +52,7 @@ fn numbers(count: usize, tag: u32) -> Vec<f32> {
 }
 
 /// A transformer for N agents, and what it sees of S joint states.
-fn transformer(agents: usize, states: usize) -> (Mat, Features) {
+fn transformer(agents: usize, states: usize) -> (Mat, Arc<Features>) {
     let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
     config.task.reward_target = RewardTarget::Team;
     config.executor = ExecutorConfig { kind: ExecutorKind::Mat, ..ExecutorConfig::default() };
@@ -60,17 +61,17 @@ fn transformer(agents: usize, states: usize) -> (Mat, Features) {
     let (spec, heads) = (feature_spec(&config.executor, &config.task), ActionHeads::new(vec![5]).unwrap());
     let mat = Mat::build(&config.executor, &spec, &heads, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
     let landmarks = Statics::landmarks(agents, 2, numbers(states * agents * 2, 1));
-    let features = spec.compute(&JointState {
+    let features = Arc::new(spec.compute(&JointState {
         positions: &numbers(states * agents * 2, 2),
         velocities: &numbers(states * agents * 2, 3),
         agent_state: &[],
         statics: landmarks.view(),
         goals: &(0..states).flat_map(|_| 0..agents as u32).collect::<Vec<_>>(),
-    });
+    }));
     (mat, features)
 }
 
-fn input(features: &Features, agents: usize, sequences: usize) -> Input<'_> {
+fn input(features: &Arc<Features>, agents: usize, sequences: usize) -> Input<'_> {
     Input { steps: 1, sequences, agents, features, hidden: Vec::new(), noise: GraphNoise::Off }
 }
 

@@ -2,6 +2,9 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 #![allow(clippy::disallowed_methods, reason = "candle's own functions are what ours are compared with")]
 
+mod chain;
+mod support;
+
 use candle_core::{DType, Device, Tensor, Var};
 use magex_core::config::{ExecutorConfig, ExecutorKind};
 use magex_core::joint_state::JointState;
@@ -13,46 +16,7 @@ use magex_nets::executor::{Input, build, feature_spec};
 use magex_nets::ops::{self, Activation, GraphBlock, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params};
 use std::sync::Arc;
-
-fn normal(n: usize, tag: u32) -> Vec<f32> {
-    let mut s = Key::new(11, Purpose::Bench, &[tag]).stream();
-    (0..n).map(|_| s.normal() as f32).collect()
-}
-
-fn var(shape: &[usize], tag: u32) -> Var {
-    Var::from_tensor(&Tensor::from_vec(normal(shape.iter().product(), tag), shape, &Device::Cpu).unwrap()).unwrap()
-}
-
-/// A fixed random projection to a scalar, so that every output matters differently.
-fn probe(y: &Tensor) -> Tensor {
-    let weights = Tensor::from_vec(normal(y.elem_count(), 99), y.shape(), &Device::Cpu).unwrap();
-    (y * weights).unwrap().sum_all().unwrap()
-}
-
-fn check(vars: &[&Var], f: &dyn Fn() -> Tensor) {
-    let grads = probe(&f()).backward().unwrap();
-    for (index, v) in vars.iter().enumerate() {
-        let grad = grads.get(v).unwrap_or_else(|| panic!("variable {index} has no gradient"));
-        let grad = grad.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        let start = v.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        let step = 1e-2;
-        let (mut worst, mut scale) = (0.0f32, 1e-3f32);
-        for place in 0..start.len().min(40) {
-            let at = (place * 37) % start.len();
-            let value = |delta: f32| {
-                let mut moved = start.clone();
-                moved[at] += delta;
-                v.set(&Tensor::from_vec(moved, v.shape(), &Device::Cpu).unwrap()).unwrap();
-                probe(&f()).to_scalar::<f32>().unwrap()
-            };
-            let numeric = (value(step) - value(-step)) / (2.0 * step);
-            worst = worst.max((numeric - grad[at]).abs());
-            scale = scale.max(grad[at].abs());
-        }
-        v.set(&Tensor::from_vec(start, v.shape(), &Device::Cpu).unwrap()).unwrap();
-        assert!(worst < 0.03 * scale, "variable {index}: off by {worst} at scale {scale}");
-    }
-}
+use support::{check, normal, probe, var};
 
 #[test]
 fn attention_and_gelu() {
@@ -110,6 +74,9 @@ fn mixing_distances_and_elu() {
     assert_eq!(gradient.to_vec1::<f32>().unwrap(), [0.0; 30]);
     assert!(ops::row_distances(&x, vec![0, 1, 2, 3, 4, 6]).is_err());
     let x = var(&[3, 21], 5);
+    check(&[&x], &|| ops::clamp(&x, -0.713, 0.317).unwrap());
+    let gap = (ops::clamp(&x, -0.7, 0.3).unwrap() - x.clamp(-0.7, 0.3).unwrap()).unwrap().abs().unwrap();
+    assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() == 0.0);
     check(&[&x], &|| ops::elu(&x).unwrap());
     let gap = (ops::elu(&x).unwrap() - x.elu(1.0).unwrap()).unwrap().abs().unwrap();
     assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-6);
@@ -120,7 +87,10 @@ fn recurrent_unit() {
     let (x, w, b) = (var(&[4, 3, 48], 1), var(&[16, 48], 2), var(&[48], 3));
     let w = Var::from_tensor(&(w.as_tensor() * 0.3).unwrap()).unwrap();
     let h0 = normal(3 * 16, 4);
-    check(&[&x, &w, &b], &|| ops::gru(&x, &w, &b, h0.clone()).unwrap());
+    check(&[&x, &w, &b], &|| {
+        let unit = ops::Gru::new(w.as_tensor().clone(), b.as_tensor().clone());
+        unit.forward(&x, h0.clone()).unwrap()
+    });
 }
 
 #[test]
@@ -306,7 +276,7 @@ fn the_gradient_of_every_executor_is_its_slope_in_every_tensor() {
         let (config, task, mut params) = drawn(name, kind, agents, 5);
         let spec = feature_spec(&config, &task);
         let states = States::new(&task, steps * sequences);
-        let features = spec.compute(&states.part(&task, 0, steps * sequences));
+        let features = Arc::new(spec.compute(&states.part(&task, 0, steps * sequences)));
         let output = |tensors: Vec<Tensor>| {
             let net = build(&config, &spec, (5, 1.0), false, &mut ParamBuilder::with(tensors)).unwrap();
             let input = Input {
@@ -372,7 +342,7 @@ fn a_joint_state_gets_the_same_bits_alone_and_in_a_batch() {
         let net = build(&config, &spec, (5, 1.0), false, &mut ParamBuilder::with(params.tensors().unwrap())).unwrap();
         let states = States::new(&task, count);
         let run = |from: usize, to: usize| {
-            let features = spec.compute(&states.part(&task, from, to));
+            let features = Arc::new(spec.compute(&states.part(&task, from, to)));
             let input = Input {
                 steps: 1,
                 sequences: to - from,
