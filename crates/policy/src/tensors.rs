@@ -27,7 +27,12 @@ impl Tensors {
             if part.policy {
                 let params = Params::load(layout, weights, part.name)?;
                 all.prefix = format!("{}.", part.name);
-                for entry in &params.entries {
+                // MAT has its value function in the same network; what acts does not read it.
+                for entry in params
+                    .entries
+                    .iter()
+                    .filter(|entry| part.name != "transformer" || !entry.name.starts_with("value."))
+                {
                     let values = params.values[entry.range()].to_vec();
                     all.by_name.insert(entry.name.clone(), (entry.shape.clone(), values));
                 }

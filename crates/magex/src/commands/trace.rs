@@ -115,7 +115,7 @@ fn episode(config: &RunConfig, weights: &[u8], args: &TraceArgs) -> anyhow::Resu
     let ShardResult::Eval(outcome) = roller.rollout(&shard, |request| answer(&goals, 0.0, request, &|| true))? else {
         return Err(anyhow::anyhow!("the rollout trained"));
     };
-    let metrics = outcome.metrics.first().copied().unwrap_or_default();
+    let metrics = outcome.metrics.iter().flat_map(|metrics| metrics.0);
     let scored = METRICS.iter().zip(metrics).filter(|(metric, _)| metric.applies(task));
     let definition = task.definition();
     let contact = task.observation().contact_radius;

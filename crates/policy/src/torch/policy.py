@@ -134,7 +134,7 @@ class Policy(nn.Module):
             hidden = hidden | out.unsqueeze(1) | out.unsqueeze(2)
         square = square.masked_fill(hidden | (square > o["sensing_radius"] ** 2), math.inf)
         square = nn.functional.pad(square, (0, k), value=math.inf)
-        nearest, index = torch.sort(square, -1, stable=True)
+        nearest, index = torch.sort(square, dim=-1, stable=True)
         nearest, index = nearest[..., :k], index[..., :k]
         exists = nearest.isfinite()
         index = index.masked_fill(~exists, 0)
@@ -162,7 +162,7 @@ class Policy(nn.Module):
         def put(points):
             to = points - p.unsqueeze(2)
             if e["nearest_first"]:
-                order = torch.sort(length(to), 2, stable=True)[1].expand(-1, -1, -1, d)
+                order = torch.sort(length(to), dim=2, stable=True)[1].expand(-1, -1, -1, d)
                 to = torch.gather(to, 2, order)
             return (to / self.half_side).reshape(batch, n, -1)
 
