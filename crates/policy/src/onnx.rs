@@ -47,7 +47,7 @@ pub fn write(source: &Source<'_>) -> Result<Vec<u8>, ExportError> {
     });
     // Absolute positions are measured in it.
     let half_side = match executor.kind {
-        ExecutorKind::Local => g.scalar(task.side / 2.0),
+        ExecutorKind::Local => Value::new(),
         _ if executor.kind.fixed_team_size() => g.scalar(task.side / 2.0),
         _ => g.input("half_side", &[Size::Fixed(1)], "half of the side of the map; see half_side in the metadata"),
     };

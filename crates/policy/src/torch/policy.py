@@ -243,7 +243,7 @@ class Policy(nn.Module):
     def head(self, x):
         return self.layer("logits.out", self.norm("logits.norm", gelu(self.layer("logits.wide", x))))
 
-    def transformer(self, s):
+    def mat(self, s):
         blocks, norm = range(self.executor["attention_blocks"]), self.norm
         x = norm("encoder.norm", gelu(self.layer("encoder.embed", norm("encoder.vector_norm", self.vector(s)))))
         for b in blocks:
@@ -280,7 +280,7 @@ class Policy(nn.Module):
             mixed = self.layer("mix", torch.cat([own, self.crowd("neighbour", s, frame)], -1))
             return self.layer("head", torch.relu(mixed)), memory
         if self.kind in ("mat", "mat-dec"):
-            return self.transformer(s), memory
+            return self.mat(s), memory
         if self.kind == "dicg":
             e = start = torch.tanh(self.layer("encoder.1", torch.tanh(self.layer("encoder.0", self.vector(s)))))
             mixing = torch.softmax(start @ self.w("attention.weight") @ start.transpose(-1, -2), -1)
