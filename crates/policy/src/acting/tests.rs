@@ -1,5 +1,5 @@
 use super::*;
-use magex_core::config::ExecutorKind;
+use magex_core::config::{ExecutorKind, Observes};
 use magex_core::task::{Spawn, TaskName};
 use magex_nets::params::{Params, to_safetensors};
 
@@ -7,6 +7,9 @@ use magex_nets::params::{Params, to_safetensors};
 fn fresh(name: TaskName, kind: ExecutorKind, agents: usize) -> (RunConfig, Vec<u8>) {
     let mut config = RunConfig { task: TaskConfig::of(name, agents, Spawn::Uniform), ..RunConfig::default() };
     config.executor.kind = kind;
+    if kind.flat() {
+        config.executor.observes = Observes::Goals;
+    }
     let config = config.validated().unwrap();
     let model = Model::new(&config).unwrap();
     let drawn: Vec<Params> = (0..)

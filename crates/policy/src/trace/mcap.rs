@@ -23,9 +23,11 @@ pub fn write(trace: &Trace) -> Vec<u8> {
     let metadata = metadata(trace);
     record(&mut bytes, 0x03, &schema);
     record(&mut bytes, 0x04, &channel);
+    let (place, length) = (bytes.len() as u64, 9 + metadata.len() as u64);
     record(&mut bytes, 0x0C, &metadata);
     let seconds = f64::from(trace.step_seconds);
-    let time = |t: usize| (t as f64 * seconds * 1e9) as u64;
+    // Whole microseconds: a tenth in single precision is not quite one.
+    let time = |t: usize| (t as f64 * seconds * 1e6).round() as u64 * 1000;
     for t in 0..trace.steps.len() {
         let mut message = 0u16.to_le_bytes().to_vec();
         message.extend((t as u32).to_le_bytes());
@@ -50,6 +52,7 @@ pub fn write(trace: &Trace) -> Vec<u8> {
     statistics.extend(0u16.to_le_bytes());
     statistics.extend(count.to_le_bytes());
     record(&mut bytes, 0x0B, &statistics);
+    record(&mut bytes, 0x0D, &[&place.to_le_bytes()[..], &length.to_le_bytes(), &text("magex")].concat());
     let footer = [&summary.to_le_bytes()[..], &0u64.to_le_bytes(), &0u32.to_le_bytes()].concat();
     record(&mut bytes, 0x02, &footer);
     bytes.extend(MAGIC);
