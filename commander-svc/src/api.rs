@@ -28,10 +28,10 @@ use tracing::Instrument as _;
 const WATCHED: usize = 1000;
 
 /// The roles of external clients.
-const CLIENT: &[Role] = &[Role::Client];
+pub(crate) const CLIENT: &[Role] = &[Role::Client];
 
 /// Streaming methods.
-pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments"];
+pub(crate) const STREAMS: &[&str] = &["AssignStream", "WatchAssignments", "ActStream"];
 
 /// Implements the service.
 pub(crate) struct CommanderApi {
@@ -61,7 +61,7 @@ impl CommanderApi {
 
 type Answer<T> = Result<Response<T>, Status>;
 
-fn budget<T>(request: &Request<T>) -> CallBudget {
+pub(crate) fn budget<T>(request: &Request<T>) -> CallBudget {
     CallBudget::start(request.extensions().get())
 }
 

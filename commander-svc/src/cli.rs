@@ -70,6 +70,9 @@ pub struct CommanderArgs {
     /// Hours after its last update at which a mission expires
     #[arg(long, default_value_t = 24, value_name = "H", value_parser = options::whole::<u32>(1, 8760), help_heading = "Limits")]
     pub mission_hours: u32,
+    /// Maximum number of agents, all teams together, of a call that asks for actions
+    #[arg(long, default_value_t = 2000, value_name = "N", value_parser = options::whole::<u32>(1, 10_000), help_heading = "Limits")]
+    pub act_agents: u32,
     /// Milliseconds for which a stopping service rejects calls with UNAVAILABLE before it closes its port
     #[arg(long, default_value_t = 500, value_name = "MS", value_parser = options::whole::<u32>(0, 5000))]
     pub drain: u32,
@@ -107,6 +110,7 @@ impl CommanderArgs {
                 each,
                 ..Bounds::default()
             },
+            act_agents: self.act_agents as usize,
             drain: Duration::from_millis(u64::from(self.drain)),
             heartbeat: self.security.heartbeat(),
             metrics: Arc::new(Metrics::new()),

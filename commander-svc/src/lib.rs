@@ -1,7 +1,8 @@
 //! The goal commander as a service: for the actors of a run, and for external clients with agents and goals.
 //!
 //! [`service`] builds and serves it; `api` implements the gRPC contract. A call of an external client goes to `assign_service`
-//! or `mission_service`. A shard of an actor goes to `shard_assign`, which asks the scheduler of its run ([`scheduler`],
+//! or `mission_service`. A step of an external
+//! client's agents goes to `policy_service`. A shard of an actor goes to `shard_assign`, which asks the scheduler of its run ([`scheduler`],
 //! [`run_scheduler`], [`shard_goals`]). `model_store` holds the weights of the learner (`subscription`) or of a file
 //! ([`weights_file`]).
 
@@ -14,6 +15,7 @@ mod error;
 mod metrics;
 mod mission_service;
 mod model_store;
+mod policy_service;
 pub mod run_scheduler;
 pub mod scheduler;
 pub mod service;

@@ -1,12 +1,12 @@
 //! The commander's Prometheus metrics, each declared once; docs/metrics.md says what they mean.
 
 use crate::scheduler::AssignmentMethod;
-use magex_runtime::metrics::{Gauge, HistogramVec, IntCounter, IntCounterVec, Metrics};
+use magex_runtime::metrics::{Gauge, Histogram, HistogramVec, IntCounter, IntCounterVec, Metrics};
 use magex_runtime::net::call_metrics::Calls;
 use std::time::Duration;
 
 /// Methods of the service; the label of a metric.
-const METHODS: [&str; 11] = [
+const METHODS: [&str; 13] = [
     "Assign",
     "AssignMany",
     "AssignStream",
@@ -18,6 +18,8 @@ const METHODS: [&str; 11] = [
     "WatchAssignments",
     "DeleteMission",
     "GetModel",
+    "Act",
+    "ActStream",
 ];
 
 /// The commander's metrics.
@@ -27,6 +29,8 @@ pub(crate) struct CommanderMetrics {
     answers: IntCounterVec,
     answer_seconds: HistogramVec,
     fallbacks: IntCounter,
+    acted_agents: IntCounter,
+    act_seconds: Histogram,
     pub(crate) in_flight: Gauge,
     pub(crate) streams: Gauge,
     pub(crate) missions: Gauge,
@@ -52,6 +56,9 @@ impl CommanderMetrics {
             ),
             fallbacks: m
                 .counter("magex_commander_fallbacks_total", "Answers by another method than the requested one."),
+            acted_agents: m.counter("magex_commander_policy_agents_total", "Agents whose actions a policy chose."),
+            act_seconds: m
+                .seconds("magex_commander_policy_seconds", "From a step of teams to the actions of its agents."),
             in_flight: m.gauge("magex_commander_inflight_calls", "Calls in flight."),
             streams: m.gauge("magex_commander_open_streams", "Open streams."),
             missions: m.gauge("magex_commander_missions", "Missions of clients."),
@@ -67,6 +74,12 @@ impl CommanderMetrics {
         }
         metrics.weights_version.set(-1.0);
         metrics
+    }
+
+    /// Counts the actions of some agents.
+    pub(crate) fn acted(&self, agents: usize, elapsed: Duration) {
+        self.acted_agents.inc_by(agents as u64);
+        self.act_seconds.observe(elapsed.as_secs_f64());
     }
 
     /// Counts an answer.

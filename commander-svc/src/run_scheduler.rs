@@ -7,6 +7,8 @@ use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_dispatch::Problem;
 use magex_nets::commander::{Commander, CommanderError, Team};
+use magex_nets::weights_file;
+use magex_policy::acting::Policies;
 use magex_proto::convert::ConvertError;
 use std::sync::Arc;
 
@@ -19,6 +21,8 @@ pub struct RunScheduler {
     commander: Commander,
     /// `commander.random_assignment_fraction` of the run.
     random_assignment_fraction: f32,
+    /// What acts, or why nothing does.
+    policies: Result<Policies, String>,
 }
 
 /// Makes the scheduler that the run's configuration (TOML) names, with its weights (safetensors).
@@ -29,7 +33,11 @@ pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn S
         None => Commander::load(&config.commander, config.task.agents, config.task.dims(), weights)
             .map_err(|error| SchedulerError::Load(error.to_string()))?,
     };
-    Ok(Arc::new(RunScheduler { commander, random_assignment_fraction: config.commander.random_assignment_fraction }))
+    let warnings = weights_file::check(weights, &config).map_err(|error| SchedulerError::Load(error.to_string()))?;
+    warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+    let policies = Policies::load(&config, weights).map_err(|error| error.to_string());
+    let random_assignment_fraction = config.commander.random_assignment_fraction;
+    Ok(Arc::new(RunScheduler { commander, random_assignment_fraction, policies }))
 }
 
 impl Scheduler for RunScheduler {
@@ -55,6 +63,10 @@ impl Scheduler for RunScheduler {
             CommanderPolicy::Random => AssignmentMethod::Random,
             CommanderPolicy::Pairwise | CommanderPolicy::Ranking => AssignmentMethod::Learned,
         }
+    }
+
+    fn policies(&self) -> Result<&Policies, &str> {
+        self.policies.as_ref().map_err(String::as_str)
     }
 
     fn assign_team(&self, problem: &Problem) -> Result<TeamReply, SchedulerError> {

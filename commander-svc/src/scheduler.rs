@@ -1,6 +1,7 @@
 //! The interface to the scheduler of a run.
 
 use magex_dispatch::Problem;
+use magex_policy::acting::Policies;
 use magex_proto::convert::ConvertError;
 pub use magex_proto::goals::{AssignmentMethod, GoalReply, GoalRequest, WeightsKey};
 use std::sync::Arc;
@@ -50,6 +51,11 @@ pub trait Scheduler: Send + Sync {
 
     /// Goals for the positions of one team of an external client; N and G may differ. Random choices are keyed by its seed.
     fn assign_team(&self, problem: &Problem) -> Result<TeamReply, SchedulerError>;
+
+    /// The policy of the same weights, or why there is none.
+    fn policies(&self) -> Result<&Policies, &str> {
+        Err("the model has no policy")
+    }
 }
 
 /// Makes a scheduler of the weights (safetensors) and the run's configuration (TOML).

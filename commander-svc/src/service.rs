@@ -5,6 +5,7 @@ use crate::assign_service::AssignService;
 use crate::metrics::CommanderMetrics;
 use crate::mission_service::MissionService;
 use crate::model_store::ModelStore;
+use crate::policy_service::PolicyApi;
 use crate::scheduler::LoadScheduler;
 use crate::shard_assign::ShardAssign;
 use crate::subscription;
@@ -13,6 +14,7 @@ use magex_dispatch::Limits;
 use magex_dispatch::disk::Disk;
 use magex_dispatch::missions::{Bounds, Missions};
 use magex_proto::v1::commander_service_server::{CommanderServiceServer, SERVICE_NAME};
+use magex_proto::v1::policy_service_server::PolicyServiceServer;
 use magex_proto::{FILE_DESCRIPTOR_SET, LEARNER, MAX_BATCH_BYTES, SERVICES};
 use magex_runtime::client::Settings;
 use magex_runtime::exit::{self, Failure};
@@ -65,6 +67,8 @@ pub struct ServiceConfig {
     pub streams: usize,
     /// Limits of the missions.
     pub missions: Bounds,
+    /// Agents of a step, all teams together, that a policy acts for.
+    pub act_agents: usize,
     /// How long a stopping service rejects calls with UNAVAILABLE before it closes its port.
     pub drain: Duration,
     /// Time between heartbeats on streams; `None` for none.
@@ -86,6 +90,7 @@ impl Default for ServiceConfig {
             calls: 64,
             streams: 16,
             missions: Bounds::default(),
+            act_agents: 2000,
             drain: Duration::ZERO,
             heartbeat: None,
             metrics: Arc::default(),
@@ -152,6 +157,14 @@ pub async fn run_and_tell(
             tokio::time::sleep(SWEEP).await;
         }
     });
+    let acting = PolicyApi {
+        store: store.clone(),
+        answering: answering.clone(),
+        in_flight: in_flight.clone(),
+        agents: config.act_agents,
+        draining: draining.clone(),
+        heartbeat: config.heartbeat,
+    };
     let api = Arc::new(CommanderApi {
         store: store.clone(),
         shards: ShardAssign::new(store.clone(), answering.clone()),
@@ -174,7 +187,10 @@ pub async fn run_and_tell(
         .max_encoding_message_size(config.message_bytes.max(MAX_BATCH_BYTES));
     let Security { tls, access } = config.security;
     let connections = incoming.connections();
-    let rules = Rules {
+    let acting = PolicyServiceServer::new(acting)
+        .max_decoding_message_size(config.message_bytes)
+        .max_encoding_message_size(config.message_bytes);
+    let rules = |access| Rules {
         access,
         in_flight: in_flight.clone(),
         streams: STREAMS,
@@ -186,7 +202,8 @@ pub async fn run_and_tell(
         |what: &str, error: &dyn Display| Failure::new(exit::INTERNAL, format!("the commander's {what}: {error}"));
     let router = server::builder()
         .add_service(Guard::public(health_service, connections.clone()))
-        .add_service(Guard::guarded(service, rules, connections.clone()));
+        .add_service(Guard::guarded(acting, rules(access.clone()), connections.clone()))
+        .add_service(Guard::guarded(service, rules(access), connections.clone()));
     let router = server::with_reflection(router, SERVICE_NAME, FILE_DESCRIPTOR_SET, &connections)
         .map_err(|error| internal("reflection service cannot be built", &error))?;
     let closed = CancellationToken::new();

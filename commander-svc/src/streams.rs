@@ -24,7 +24,7 @@ use tonic_types::StatusExt as _;
 /// Capacity of the queue of answers to a client.
 pub(crate) const AHEAD: usize = 2;
 /// A client that does not read for this time loses its stream.
-const READ_TIMEOUT: Duration = Duration::from_secs(60);
+pub(crate) const READ_TIMEOUT: Duration = Duration::from_secs(60);
 /// Assignments of a snapshot that are fetched together.
 const PAGE: usize = 64;
 
@@ -88,7 +88,7 @@ async fn one(
     answering.respond(problem, budget).await
 }
 
-fn problem(status: &Status) -> v1::AssignProblem {
+pub(crate) fn problem(status: &Status) -> v1::AssignProblem {
     let fields = status.get_details_bad_request().map(|details| details.field_violations).unwrap_or_default();
     v1::AssignProblem {
         code: status.code() as i32 as u32,

@@ -355,7 +355,7 @@ pub fn read(folder: &Path, template: &Learned) -> Result<(Progress, Learned), Ch
         }
         None => None,
     };
-    Ok((state.progress, Learned { networks, value_norm: state.value_norm, replay }))
+    Ok((state.progress, Learned { networks, value_norm: state.value_norm, replay, about: template.about.clone() }))
 }
 
 /// Rejects a run folder whose newest checkpoint has another format, before anything else in it is read: its configuration

@@ -127,7 +127,7 @@ impl Parent {
         let config = RunConfig::from_toml(&text).map_err(|error| unusable(format!("{CONFIG_FILE}: {error}")))?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
         // Weights and optimisers: the new run fills a replay buffer of its own.
-        let template = Learned { replay: None, ..Learned::init(&Algorithm::new(&config)?, &commander)? };
+        let template = Learned { replay: None, ..Learned::init(&config, &Algorithm::new(&config)?, &commander)? };
         let (progress, learned, skipped) = checkpoint::read_latest(folder, &template).map_err(|error| match error {
             CheckpointError::None(_) => unusable("it has no checkpoint to begin from".to_owned()),
             other => other.into(),

@@ -230,7 +230,7 @@ impl Trainer {
         check_buffer(config)?;
         let algorithm = Algorithm::new(config)?;
         let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
-        let learned = Learned::init(&algorithm, &commander)?;
+        let learned = Learned::init(config, &algorithm, &commander)?;
         // Differentiation recurses through the graph: the default stack of a thread is too small for long sequences.
         let pool = pool(threads.max(1))?;
         let toml = config.to_toml()?;

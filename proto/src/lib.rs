@@ -25,8 +25,11 @@ pub fn encoded_len(message: &impl prost::Message) -> usize {
 }
 
 /// The services of this program on the wire, and their names for people.
-pub const SERVICES: [(&str, &str); 2] =
-    [(v1::learner_service_server::SERVICE_NAME, LEARNER), (v1::commander_service_server::SERVICE_NAME, COMMANDER)];
+pub const SERVICES: [(&str, &str); 3] = [
+    (v1::learner_service_server::SERVICE_NAME, LEARNER),
+    (v1::commander_service_server::SERVICE_NAME, COMMANDER),
+    (v1::policy_service_server::SERVICE_NAME, COMMANDER),
+];
 
 /// The learner's name for people.
 pub const LEARNER: &str = "learner";

@@ -13,9 +13,10 @@ use magex::folder;
 use magex::output::{note, thousands};
 use magex::settings;
 use magex::supervise::service::Service;
+use magex_core::about::About;
 use magex_core::config::{CommanderConfig, CommanderPolicy, RunConfig};
 use magex_nets::commander::Commander;
-use magex_nets::params::to_safetensors;
+use magex_nets::weights_file;
 use magex_proto::v1;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -156,7 +157,7 @@ fn weights(args: &AssignArgs, place: &Path) -> anyhow::Result<(Vec<u8>, RunConfi
     let mut config = RunConfig::default();
     config.commander = CommanderConfig { kind: CommanderPolicy::Pairwise, ..config.commander };
     let params = Commander::init(&config.commander, config.task.agents, 2, config.run.seed)?;
-    let bytes = to_safetensors(&[("commander", &params)], "{\"format\":1}")?;
+    let bytes = weights_file::write(&[("commander", &params)], &About::of(&config))?;
     std::fs::create_dir_all(place)?;
     Ok((bytes, config, "pairwise, untrained; name a trained one with --run".to_owned()))
 }

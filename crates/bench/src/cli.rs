@@ -1,7 +1,7 @@
 //! The command line: the tables of docs/results.md, measured on this machine.
 
 use crate::report::Report;
-use crate::{assign, cluster, endless, env, goals, messages, powers, runs, soak, tasks, training, update};
+use crate::{act, assign, cluster, endless, env, goals, messages, powers, runs, soak, tasks, training, update};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use magex::failure;
 use magex::options::CommonOptions;
@@ -48,6 +48,8 @@ enum What {
     Update(update::UpdateArgs),
     /// Goal assignment: solver, learned scheduler, and the service with its clients.
     Assign(assign::AssignArgs),
+    /// Policies as a service: latency and calls per second.
+    Act(act::ActArgs),
     /// Cost of the commander's assignments over the exact ones.
     Commander(goals::CommanderArgs),
     /// What powers of distances do to a team that moves, with a trained executor.
@@ -80,10 +82,11 @@ enum What {
 /// The command lines that run without a subcommand.
 const QUICK: [&[&str]; 4] = [&["env"], &["update"], &["assign", "--solver"], &["commander"]];
 /// The command lines of `all`.
-const ALL: [&[&str]; 10] = [
+const ALL: [&[&str]; 11] = [
     &["env"],
     &["update"],
     &["assign"],
+    &["act"],
     &["commander"],
     &["ranking"],
     &["distributed"],
@@ -135,6 +138,7 @@ fn measure(what: &What) -> anyhow::Result<Report> {
         What::Env(args) => env::env(args),
         What::Update(args) => update::update(args),
         What::Assign(args) => assign::assign(args),
+        What::Act(args) => act::act(args),
         What::Commander(args) => goals::commander(args),
         What::Powers(args) => powers::powers(args),
         What::Ranking(args) => goals::ranking(args),

@@ -3,6 +3,7 @@
 //! Benchmarks of whole runs and services start child processes of `magex`. So that these are always built from the same
 //! sources, this executable contains `magex` and behaves like it when it is called by that name.
 
+mod act;
 mod assign;
 mod cli;
 mod cluster;

@@ -3,6 +3,7 @@
 use crate::report::Report;
 use crate::stats::quantile;
 use magex::settings;
+use magex_core::about::About;
 use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::rng::{Key, Purpose};
@@ -157,7 +158,9 @@ fn minibatch(config: &RunConfig, minibatches: usize, rounds: usize) -> Result<Mi
             for (epochs, times) in (1u32..).zip(&mut time) {
                 config.mappo.epochs = epochs;
                 let mappo = Mappo::new(&config)?;
-                let mut learned = Learned { networks: mappo.init()?, value_norm: mappo.value_norm(), replay: None };
+                let about = About::of(&config);
+                let mut learned =
+                    Learned { networks: mappo.init()?, value_norm: mappo.value_norm(), replay: None, about };
                 let mut batch = Batch::new(config.run.seed, mappo.spec(), std::slice::from_ref(&trajectory));
                 // The update refuses those of another policy.
                 batch.log_probs = mappo.log_probs(&learned, &batch)?;

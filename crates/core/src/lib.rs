@@ -3,6 +3,7 @@
 //!
 //! The learner knows a task only by its [`task::TaskConfig`]; the physics lives in `magex-env`.
 
+pub mod about;
 pub mod config;
 pub mod error;
 pub mod ids;

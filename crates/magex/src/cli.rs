@@ -1,6 +1,8 @@
 //! The command line: commands and exit codes.
 
-use crate::commands::{assign, bench, compare, eval, health, replay, reproduce, roles, train, train_commander, verify};
+use crate::commands::{
+    act, assign, bench, compare, eval, export, health, replay, reproduce, roles, trace, train, train_commander, verify,
+};
 use crate::failure;
 use crate::options::CommonOptions;
 use crate::output::note;
@@ -43,8 +45,11 @@ enum Command {
     TrainCommander(train_commander::TrainCommanderArgs),
     Eval(eval::EvalArgs),
     Replay(replay::ReplayArgs),
+    Trace(trace::TraceArgs),
     Compare(compare::CompareArgs),
     Reproduce(reproduce::ReproduceArgs),
+    Act(act::ActArgs),
+    Export(export::ExportArgs),
     Assign(assign::AssignArgs),
     Bench(bench::BenchArgs),
     Verify(verify::VerifyArgs),
@@ -82,8 +87,11 @@ pub fn main() -> ExitCode {
         Command::TrainCommander(args) => train_commander::run(args, &options),
         Command::Eval(args) => eval::run(args, &options),
         Command::Replay(args) => replay::run(args, &options),
+        Command::Trace(args) => trace::run(args, &options),
         Command::Compare(args) => compare::run(args, &options),
         Command::Reproduce(args) => reproduce::run(args, &options),
+        Command::Act(args) => act::run(args, &options),
+        Command::Export(args) => export::run(args, &options),
         Command::Assign(args) => assign::run(args, &options),
         Command::Bench(args) => Ok(bench::run(args, &options)),
         Command::Verify(args) => verify::run(args, &options),

@@ -22,6 +22,7 @@ use magex_learner::run_lock::LockError;
 use magex_learner::train::algorithm::Algorithm;
 use magex_learner::train::commander_ppo::CommanderPpo;
 use magex_learner::train::learned::Learned;
+use magex_nets::weights_file;
 use std::path::{Path, PathBuf};
 
 /// The effective configuration.
@@ -35,14 +36,7 @@ pub(crate) fn default_name(config: &RunConfig) -> String {
     format!("{}-s{}", group_name(config), config.run.seed)
 }
 
-/// `<task>-<N>-<executor>`, or the algorithm where that is not MAPPO.
-pub(crate) fn group_name(config: &RunConfig) -> String {
-    let system = match config.run.algorithm {
-        magex_core::config::Algorithm::Mappo => config.executor.kind.to_string(),
-        other => other.to_string(),
-    };
-    format!("{}-{}-{system}", config.task.name, config.task.agents)
-}
+pub(crate) use magex_core::about::group_name;
 
 /// The folder of all runs, unless an option says otherwise.
 pub(crate) const RUNS: &str = "runs";
@@ -149,8 +143,9 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
         };
         let weights = std::fs::read(path).with_context(|| path.display().to_string())?;
         let config = crate::settings::read_from("--config", config)?;
+        let notes = weights_file::check(&weights, &config).with_context(|| path.display().to_string())?;
         let (sha256, name) = (sha256::hex(&weights), path.display().to_string());
-        return Ok(Trained { config, weights, sha256, name, folder: None, notes: Vec::new(), is_final: true });
+        return Ok(Trained { config, weights, sha256, name, folder: None, notes, is_final: true });
     }
     if !path.is_dir() {
         return Err(usage(format!("RUN: {} does not exist", path.display())));
@@ -159,7 +154,8 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
         return Err(usage("--config: a run folder has its own configuration; leave it out"));
     }
     let config = config_of(path)?;
-    let (weights, notes, is_final) = weights_of(path, &config)?;
+    let (weights, mut notes, is_final) = weights_of(path, &config)?;
+    notes.extend(weights_file::check(&weights, &config).with_context(|| path.display().to_string())?);
     let name = path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
     Ok(Trained { config, sha256: sha256::hex(&weights), weights, name, folder: Some(path.to_owned()), notes, is_final })
 }
@@ -193,7 +189,7 @@ fn weights_of(folder: &Path, config: &RunConfig) -> anyhow::Result<(Vec<u8>, Vec
     }
     let commander = CommanderPpo::new(&config.commander, &config.task, config.run.seed);
     // An evaluation needs no replay buffer.
-    let template = Learned { replay: None, ..Learned::init(&Algorithm::new(config)?, &commander)? };
+    let template = Learned { replay: None, ..Learned::init(config, &Algorithm::new(config)?, &commander)? };
     let (progress, learned, skipped) = checkpoint::read_latest(folder, &template)?;
     notes.extend(skipped.iter().map(what_is_wrong));
     notes.push(format!("using checkpoint {:06}", progress.iteration));

@@ -122,7 +122,7 @@ impl Commander {
     }
 
     /// Names, shapes and initial distributions of the parameters; none for schedulers that are not learned.
-    fn layout(config: &CommanderConfig, agents: usize, dims: usize) -> Result<Vec<Entry>, ParamError> {
+    pub(crate) fn layout(config: &CommanderConfig, agents: usize, dims: usize) -> Result<Vec<Entry>, ParamError> {
         let mut params = ParamBuilder::layout();
         Self::build(config, agents, dims, &mut params)?;
         Ok(params.entries())

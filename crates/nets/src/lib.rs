@@ -8,6 +8,7 @@
 //! | [`distribution`] | categorical actions |
 //! | [`ops`] | layers as custom operations with hand-written gradients |
 //! | [`params`] | parameters: initialisation, order, weights files |
+//! | [`weights_file`] | what a weights file says about itself |
 
 #![allow(
     clippy::needless_range_loop,
@@ -20,3 +21,4 @@ pub mod executor;
 pub mod features;
 pub mod ops;
 pub mod params;
+pub mod weights_file;

@@ -151,14 +151,9 @@ impl Params {
         let mut values = Vec::new();
         for entry in &entries {
             let name = format!("{network}.{}", entry.name);
-            let view = file.tensor(&name).map_err(|_| ParamError::Mismatch(format!("{name} is missing")))?;
+            let view = file.tensor(&name).map_err(|_| missing(&file, network, &name))?;
             if view.dtype() != safetensors::Dtype::F32 || view.shape() != entry.shape {
-                return Err(ParamError::Mismatch(format!(
-                    "{name} is {:?} {:?}, expected F32 {:?}; was it trained with another configuration or team size?",
-                    view.dtype(),
-                    view.shape(),
-                    entry.shape
-                )));
+                return Err(misfit(&name, &view, &entry.shape));
             }
             for chunk in view.data().chunks_exact(4) {
                 let value = f32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]);
@@ -220,6 +215,39 @@ pub fn to_safetensors(networks: &[(&str, &Params)], note: &str) -> Result<Vec<u8
         .collect();
     // safetensors keeps metadata in a hash map; one entry has only one order.
     Ok(safetensors::serialize(views?, Some(HashMap::from([("magex".to_owned(), note.to_owned())])))?)
+}
+
+/// Why a tensor cannot be used, with the remedy.
+fn misfit(name: &str, view: &safetensors::tensor::TensorView<'_>, wanted: &[usize]) -> ParamError {
+    let (dtype, shape) = (view.dtype(), view.shape());
+    let reversed: Vec<usize> = shape.iter().rev().copied().collect();
+    let problem = if dtype != safetensors::Dtype::F32 {
+        format!(
+            "{name} is {dtype:?} {shape:?}, expected F32 {wanted:?}; convert every tensor to F32 (single precision)"
+        )
+    } else if shape.len() == 2 && reversed == wanted {
+        format!(
+            "{name} is F32 {shape:?}, expected F32 {wanted:?}: it is transposed; weights are stored [inputs, outputs], \
+             PyTorch's Linear has them the other way round"
+        )
+    } else {
+        format!(
+            "{name} is F32 {shape:?}, expected F32 {wanted:?}; was it trained with another configuration or team size?"
+        )
+    };
+    ParamError::Mismatch(problem)
+}
+
+/// Why a tensor is not there, with the remedy.
+fn missing(file: &safetensors::SafeTensors<'_>, network: &str, name: &str) -> ParamError {
+    let whole = network == "commander" && !file.names().iter().any(|name| name.starts_with("commander."));
+    ParamError::Mismatch(match whole {
+        true => format!(
+            "{name} is missing: the file holds no goal scheduler, only what acts; add --scheduler exact (or makespan, greedy), or \
+             set commander.kind = \"exact\" in its configuration"
+        ),
+        false => format!("{name} is missing"),
+    })
 }
 
 /// Orthogonal matrix [rows, columns] times a gain: Gram–Schmidt on Gaussian vectors, in double precision.

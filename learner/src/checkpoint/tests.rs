@@ -12,7 +12,7 @@ fn learned() -> Learned {
         ..RunConfig::default()
     };
     let commander = CommanderPpo::new(&config.commander, &config.task, 1);
-    Learned::init(&Algorithm::new(&config).unwrap(), &commander).unwrap()
+    Learned::init(&config, &Algorithm::new(&config).unwrap(), &commander).unwrap()
 }
 
 fn progress(iteration: u32) -> Progress {

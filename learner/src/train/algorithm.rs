@@ -8,6 +8,7 @@ use crate::train::mappo::Mappo;
 use crate::train::qmix::Qmix;
 use crate::train::stats::UpdateStats;
 use crate::train::suspect::{Suspect, UpdateError};
+use magex_core::about::About;
 use magex_core::config::{Algorithm as Name, RunConfig};
 use magex_core::trajectory::Trajectory;
 use magex_nets::params::ParamError;
@@ -73,12 +74,12 @@ impl Algorithm {
 impl Learned {
     /// Initial networks and optimisers, and an empty replay buffer for algorithms that have one. Here rather than in
     /// [`crate::train::learned`], which knows no algorithm.
-    pub fn init(algorithm: &Algorithm, commander: &CommanderPpo) -> Result<Self, ParamError> {
+    pub fn init(config: &RunConfig, algorithm: &Algorithm, commander: &CommanderPpo) -> Result<Self, ParamError> {
         let (mut networks, value_norm, replay) = match algorithm {
             Algorithm::Mappo(mappo) => (mappo.init()?, mappo.value_norm(), None),
             Algorithm::Qmix(qmix) => (qmix.init()?, ValueNorm::new(false), Some(qmix.replay())),
         };
         networks.push(commander.init()?);
-        Ok(Self { networks, value_norm, replay })
+        Ok(Self { networks, value_norm, replay, about: About::of(config) })
     }
 }

@@ -2,7 +2,9 @@
 
 use crate::train::gae::ValueNorm;
 use crate::train::replay::Replay;
-use magex_nets::params::{ParamError, Params, to_safetensors};
+use magex_core::about::About;
+use magex_nets::params::{ParamError, Params};
+use magex_nets::weights_file;
 
 /// What an optimiser remembers of one network's gradients.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -44,6 +46,8 @@ pub struct Learned {
     pub value_norm: ValueNorm,
     /// The replay buffer of an off-policy algorithm.
     pub replay: Option<Replay>,
+    /// What the weights say about themselves.
+    pub about: About,
 }
 
 impl Learned {
@@ -65,6 +69,6 @@ impl Learned {
     fn file(&self, which: fn(&Network) -> bool) -> Result<Vec<u8>, ParamError> {
         let networks = self.networks.iter().filter(|network| which(network));
         let named: Vec<(&str, &Params)> = networks.map(|network| (network.name.as_str(), &network.params)).collect();
-        to_safetensors(&named, "{\"format\":1}")
+        weights_file::write(&named, &self.about)
     }
 }

@@ -34,7 +34,7 @@ impl Default for Run {
         let toml = config.to_toml().expect("a configuration can be written");
         let algorithm = Algorithm::new(&config).expect("a small network");
         let commander = CommanderPpo::new(&config.commander, &config.task, 1);
-        let learned = Learned::init(&algorithm, &commander).expect("small networks");
+        let learned = Learned::init(&config, &algorithm, &commander).expect("small networks");
         let limits = Limits::for_task(&config.task, 4);
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress {

@@ -11,6 +11,7 @@ use crate::parallel;
 use crate::settings;
 use crate::synthetic::Synthetic;
 use magex_assign::exact_points;
+use magex_core::about::About;
 use magex_core::config::{CommanderPolicy, RunConfig, SEED_MAX};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
@@ -19,7 +20,7 @@ use magex_core::task::Spawn;
 use magex_learner::run_folder::FolderError;
 use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
 use magex_learner::train::learned::Network;
-use magex_nets::params::to_safetensors;
+use magex_nets::weights_file;
 use magex_runtime::options;
 use magex_runtime::process::processors;
 use magex_runtime::{exit, shutdown};
@@ -163,7 +164,7 @@ impl Training {
                 }
             }
         }
-        let weights = to_safetensors(&[("commander", &network.params)], "{\"format\":1}")?;
+        let weights = weights_file::write(&[("commander", &network.params)], &About::of(&self.config))?;
         let summary = json!({
             "weights_sha256": sha256::hex(&weights), "imitation_steps": imitation, "ppo_updates": ppo,
             "batch": batch, "synthetic_instances": u64::from(imitation + ppo) * u64::from(batch),

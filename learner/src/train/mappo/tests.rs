@@ -1,5 +1,6 @@
 use super::*;
 use candle_core::Device;
+use magex_core::about::About;
 use magex_nets::distribution::ActionHeads;
 
 /// The gradient of a scalar against finite differences, entry by entry.
@@ -101,7 +102,8 @@ fn copies(kind: magex_core::config::ExecutorKind) -> f64 {
     (config.mappo.actor_learning_rate, config.mappo.critic_learning_rate) = (3e-3, 3e-3);
     (config.collect.episodes_per_iteration, config.collect.shards_per_iteration) = (episodes, 1);
     let mappo = Mappo::new(&config.validated().unwrap()).unwrap();
-    let mut learned = Learned { networks: mappo.init().unwrap(), value_norm: mappo.value_norm(), replay: None };
+    let about = About::of(&mappo.config);
+    let mut learned = Learned { networks: mappo.init().unwrap(), value_norm: mappo.value_norm(), replay: None, about };
     let mut share = 0.0;
     for iteration in 0..rounds {
         let shard = crate::fixtures::train_shard(iteration, 0, episodes);

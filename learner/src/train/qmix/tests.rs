@@ -1,6 +1,7 @@
 use super::*;
 use crate::fixtures::{train_shard, trajectory};
 use crate::train::learned::Moments;
+use magex_core::about::About;
 use magex_core::task::{RewardTarget, Spawn, TaskConfig, TaskName};
 use magex_core::trajectory::Trajectory;
 
@@ -135,6 +136,7 @@ fn it_solves_a_monotone_matrix_game() {
         networks: qmix.init().unwrap(),
         value_norm: crate::train::gae::ValueNorm::new(false),
         replay: Some(qmix.replay()),
+        about: About::of(&config),
     };
     let mut stream = Key::new(3, Purpose::Bench, &[]).stream();
     let mut loss = f64::NAN;
@@ -173,7 +175,7 @@ fn a_batch_that_is_not_finite_changes_nothing_and_is_counted() {
     let mut networks = qmix.init().unwrap();
     networks[3].params.values[0] = f32::INFINITY;
     let value_norm = crate::train::gae::ValueNorm::new(false);
-    let mut learned = Learned { networks, value_norm, replay: Some(qmix.replay()) };
+    let mut learned = Learned { networks, value_norm, replay: Some(qmix.replay()), about: About::of(&config) };
     let before = learned.networks.clone();
     let t = random(&config.task, 4, &mut Key::new(3, Purpose::Bench, &[]).stream(), 0);
     let stats = qmix.update(&mut learned, &[t], 0).unwrap();
@@ -188,7 +190,8 @@ fn targets_are_copied_as_often_as_the_configuration_says() {
     config.qmix.target_update_every = 6;
     let qmix = Qmix::new(&config).unwrap();
     let value_norm = crate::train::gae::ValueNorm::new(false);
-    let mut learned = Learned { networks: qmix.init().unwrap(), value_norm, replay: Some(qmix.replay()) };
+    let mut learned =
+        Learned { networks: qmix.init().unwrap(), value_norm, replay: Some(qmix.replay()), about: About::of(&config) };
     let start = learned.networks.clone();
     let mut stream = Key::new(3, Purpose::Bench, &[]).stream();
     let mut update = |learned: &mut Learned, iteration| {
