@@ -1,14 +1,15 @@
 //! A trained policy outside of training: traces, actions on standard input, actions over gRPC, and weights files that must not pass.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
 use magex_proto::v1;
 use magex_proto::v1::act_stream_response::Result as Answer;
 use magex_proto::v1::policy_service_client::PolicyServiceClient;
 use magex_runtime::client;
-use magex_tests::sandbox::{Process, binary};
 use serde_json::Value;
-use std::io::Write as _;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 use tonic::Code;
 use tonic::transport::Channel;
@@ -39,7 +40,7 @@ fn run() -> &'static Run {
 }
 
 fn magex(arguments: &[&str], input: &str) -> Output {
-    let mut child = Command::new(binary())
+    let mut child = Command::new(env!("CARGO_BIN_EXE_magex"))
         .args(arguments)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -122,11 +123,8 @@ fn actions_on_standard_input_are_those_of_the_trace() {
 async fn actions_over_grpc_are_those_of_the_trace_and_wrong_calls_are_named() {
     let (_, steps) = trace();
     let folder = run().folder.display().to_string();
-    let log = run().folder.with_file_name("commander.log");
-    let mut service =
-        Process::start(&["commander", "--listen", "127.0.0.1:0", "--weights", &folder, "--act-agents", "40"], &log);
-    let url = format!("http://{}", service.ready());
-    let channel = client::endpoint(&url).unwrap().connect().await.unwrap();
+    let service = Service::start(&["--weights", &folder, "--act-agents", "40"]);
+    let channel = client::endpoint(&service.url).unwrap().connect().await.unwrap();
     let mut client: PolicyServiceClient<Channel> = PolicyServiceClient::new(channel);
     let mut memory = bytes::Bytes::new();
     for step in &steps {
@@ -197,10 +195,40 @@ async fn actions_over_grpc_are_those_of_the_trace_and_wrong_calls_are_named() {
         assert_eq!((status.code(), &*named), (Code::InvalidArgument, field), "{}", status.message());
     }
     // Nothing to act with.
-    let mut bare = Process::start(&["commander", "--listen", "127.0.0.1:0"], &log);
-    let channel = client::endpoint(&format!("http://{}", bare.ready())).unwrap().connect().await.unwrap();
+    let bare = Service::start(&[]);
+    let channel = client::endpoint(&bare.url).unwrap().connect().await.unwrap();
     let status = PolicyServiceClient::new(channel).act(request(step)).await.unwrap_err();
     assert!(status.code() == Code::FailedPrecondition && status.message().contains("--weights"), "{status}");
+}
+
+/// A commander; killed when dropped.
+struct Service {
+    child: Child,
+    url: String,
+}
+
+impl Service {
+    fn start(arguments: &[&str]) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_magex"))
+            .args(["commander", "--listen", "127.0.0.1:0"])
+            .args(arguments)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let ready: Value = serde_json::from_str(&line).unwrap();
+        Self { child, url: format!("http://{}", ready["address"].as_str().unwrap()) }
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
 }
 
 /// The header of a safetensors file, and what stands behind it.
