@@ -77,7 +77,7 @@ fn writer(format: u32) -> &'static str {
     match format {
         1 => "magex 0.1.0 (commit 389f705)",
         // The same files; what is computed on from them has other bits.
-        2 => "magex 0.2.0 (commit 335875b or before)",
+        2 => "magex 0.2.0 (commit aa62ae4 or before)",
         _ => "another release of magex",
     }
 }
