@@ -289,8 +289,8 @@ impl<const D: usize> Candidates for Points<D> {
         }
     }
 
-    fn reprice(&mut self, price: &[f64]) {
-        self.tree.reprice(price);
+    fn reprice(&mut self, col: u32, before: f64, price: &[f64]) {
+        self.tree.reprice(col, before, price);
     }
 
     fn cost(&self, row: u32, col: u32) -> f64 {
