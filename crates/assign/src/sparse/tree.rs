@@ -117,7 +117,9 @@ impl<const D: usize> Tree<D> {
             return;
         }
         let mut largest = f64::NEG_INFINITY;
-        price[start as usize..end as usize].iter().for_each(|&price| largest = if price > largest { price } else { largest });
+        price[start as usize..end as usize]
+            .iter()
+            .for_each(|&price| largest = if price > largest { price } else { largest });
         loop {
             let node = &mut self.nodes[place as usize];
             if node.largest_price == largest {
@@ -126,7 +128,8 @@ impl<const D: usize> Tree<D> {
             node.largest_price = largest;
             let Some(parent) = self.path.pop() else { return };
             let second = self.nodes[parent as usize].second;
-            let (one, other) = (self.nodes[parent as usize + 1].largest_price, self.nodes[second as usize].largest_price);
+            let (one, other) =
+                (self.nodes[parent as usize + 1].largest_price, self.nodes[second as usize].largest_price);
             largest = if other > one { other } else { one };
             place = parent;
         }
