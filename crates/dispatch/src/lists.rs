@@ -1,5 +1,6 @@
 //! Teams without a matrix: which need none, what their pairs cost, and what stands in their way.
 
+use crate::UNASSIGNED;
 use crate::costs::Obstacle;
 use crate::problem::Problem;
 use magex_assign::powered;
@@ -25,12 +26,13 @@ pub(crate) struct Listed {
 
 impl Problem {
     /// Whether a method answers this team without a matrix: exact and makespan positions with a power only, exact also sparse
-    /// costs without capacities.
+    /// costs without capacities. A makespan with a switching cost needs one.
     fn needs_no_matrix(&self) -> bool {
         let exact = matches!(self.scheduler, AssignmentMethod::Exact | AssignmentMethod::Learned);
         let listed = self.only_overrides && self.terms.capacities.is_empty();
-        self.cells() > LARGE_CELLS
-            && ((exact && listed) || ((exact || self.scheduler == AssignmentMethod::Makespan) && self.positions_only()))
+        let switches = self.switching_cost > 0.0 && self.current.iter().any(|&goal| goal != UNASSIGNED);
+        let makespan = self.scheduler == AssignmentMethod::Makespan && !switches;
+        self.cells() > LARGE_CELLS && ((exact && listed) || ((exact || makespan) && self.positions_only()))
     }
 
     /// Entries of a matrix that take as much memory as an answer: N · S, or what grows with members and listed pairs.
@@ -142,7 +144,6 @@ impl Problem {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::UNASSIGNED;
     use crate::problem::Limits;
     use crate::terms::Terms;
     use magex_core::rng::{Key, Purpose, Stream};

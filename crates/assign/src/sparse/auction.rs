@@ -92,6 +92,9 @@ impl<C: Candidates> Engine<C> {
             let mut row = first;
             loop {
                 self.bids += 1;
+                if self.bids.is_multiple_of(256) && !should_continue() {
+                    return Err(AssignError::Interrupted);
+                }
                 let best = self.best(row);
                 if best.col as usize >= self.cols() {
                     (self.col_of_row[row as usize], self.row_of_col[best.col as usize]) = (best.col, row);

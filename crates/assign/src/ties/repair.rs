@@ -224,6 +224,9 @@ impl<const N: usize> Repair<'_, N> {
                     break;
                 }
                 budget = budget.saturating_sub(1);
+                if budget % 256 == 255 && !should_continue() {
+                    return Err(AssignError::Interrupted);
+                }
                 self.price[at] = self.price[at].minus(margin);
                 let displaced = std::mem::replace(&mut solution.row_of_col[at], row);
                 solution.col_of_row[row as usize] = col;
