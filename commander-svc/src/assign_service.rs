@@ -95,7 +95,7 @@ impl AssignService {
         let (small, learned) = (problem.cells() <= SMALL, problem.scheduler == AssignmentMethod::Learned);
         let (here, cells) = match learned {
             true => (self.small_for_model(problem, &budget), engine::learned_cells(problem)),
-            false => (small, problem.cells()),
+            false => (small, problem.memory()),
         };
         let should_continue = || !budget.over();
         let planned = if here {

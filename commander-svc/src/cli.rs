@@ -46,8 +46,8 @@ pub struct CommanderArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub client: ClientArgs,
-    /// Maximum number of agents, and of goals, of a team
-    #[arg(long, default_value_t = 5000, value_name = "N", value_parser = options::whole::<u32>(1, 10_000), help_heading = "Limits")]
+    /// Maximum number of agents, and of goals, of a team; a matrix, where one is needed, has at most 100,000,000 pairs
+    #[arg(long, default_value_t = 5000, value_name = "N", value_parser = options::whole::<u32>(1, 100_000), help_heading = "Limits")]
     pub max_agents: u32,
     /// Maximum message size, MiB
     #[arg(long, default_value_t = 32, value_name = "MIB", value_parser = options::whole::<u32>(1, 1024), help_heading = "Limits")]

@@ -11,7 +11,7 @@
 mod problem;
 mod shortlist;
 
-use crate::ties::{self, Graph, NONE, Solution};
+use crate::ties::{self, Graph, Memory, NONE, Solution};
 use crate::{AssignError, Assignment, Switching, UNASSIGNED, check_costs, cost_of};
 use problem::Matrix;
 use shortlist::{Shortlists, WORTH_IT};
@@ -47,6 +47,7 @@ pub struct Solver {
     /// `[rows]` dual price of each row, once all have a column.
     row_price: Vec<f64>,
     near: Graph,
+    memory: Memory,
 }
 
 /// A row of the shortest-path tree.
@@ -141,7 +142,7 @@ impl Solver {
         should_continue: &dyn Fn() -> bool,
     ) -> Result<(), AssignError> {
         let (rows, cols) = (matrix.rows.min(matrix.cols), matrix.rows.max(matrix.cols));
-        let Self { stride, price, row_price, row_of_col, col_of_row, near, .. } = self;
+        let Self { stride, price, row_price, row_of_col, col_of_row, near, memory, .. } = self;
         let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
         row_price.clear();
         row_price.extend(
@@ -166,7 +167,7 @@ impl Solver {
         }
         let row_of_col = &mut row_of_col[..cols];
         let mut solution = Solution { row_price, col_price: &price[..cols], col_of_row, row_of_col };
-        ties::settle(near, tolerance, &mut solution, matrix, should_continue)
+        ties::settle(near, tolerance, &mut solution, matrix, memory, should_continue)
     }
 
     fn run(

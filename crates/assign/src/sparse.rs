@@ -9,6 +9,7 @@
 mod auction;
 mod candidates;
 mod costs;
+mod line;
 mod pairs;
 mod points;
 mod search;
@@ -23,9 +24,9 @@ pub use pairs::{AllowedPairs, solve_pairs};
 pub use points::{PointProblem, exact_points, solve_points};
 pub use threshold::bottleneck_points;
 
-/// Nearly tight pairs per row, on average, beyond which they are not collected: points on a line have nearly as many as there
-/// are pairs.
-const MOST_NEAR: usize = 64;
+/// Nearly tight pairs beyond which they are not collected, in all: points on a line that is not along an axis have nearly as
+/// many as there are pairs.
+const MOST_NEAR: usize = 1 << 25;
 
 /// The numbers of rows and columns in the problem, by their numbers in the solver.
 struct Order {
@@ -48,7 +49,6 @@ fn solve<C: Candidates>(
     let mut state = State::of(&engine, order);
     let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
     let mut tolerance = ties::tolerance(rows, magnitude(&state.row_price), magnitude(&state.col_price));
-    let most = MOST_NEAR * rows + 1_000_000;
     loop {
         let mut beaten = 0.0;
         state.near.clear();
@@ -57,7 +57,7 @@ fn solve<C: Candidates>(
                 return Err(AssignError::Interrupted);
             }
             beaten += state.collect(&mut engine, order, row, tolerance);
-            if state.near.cols.len() > most {
+            if state.near.cols.len() > MOST_NEAR {
                 return Ok(state.col_of_row);
             }
         }
@@ -73,7 +73,7 @@ fn solve<C: Candidates>(
         col_of_row: &mut col_of_row,
         row_of_col: &mut row_of_col,
     };
-    ties::settle(&near, tolerance, &mut solution, exact, should_continue)?;
+    ties::settle(&near, tolerance, &mut solution, exact, &mut ties::Memory::default(), should_continue)?;
     Ok(col_of_row)
 }
 

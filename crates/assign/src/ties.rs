@@ -79,6 +79,13 @@ impl Graph {
     }
 }
 
+/// Buffers of the usual case: small problems would spend a good part of their time on allocating them.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Memory {
+    degree: Vec<u32>,
+    ready: Vec<u32>,
+}
+
 /// More than the rounding errors of the reduced costs of a matching of `pairs` pairs can be, where the prices of rows and of
 /// columns are no larger than these. A reduced cost is wrong by 2^-53 of the magnitude of each of its few partial sums.
 pub(crate) fn tolerance(pairs: usize, largest_row_price: f64, largest_col_price: f64) -> f64 {
@@ -92,6 +99,7 @@ pub(crate) fn settle(
     tolerance: f64,
     solution: &mut Solution<'_>,
     exact: &impl Exact,
+    memory: &mut Memory,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<(), AssignError> {
     let spare_columns = solution.col_price.len() > near.rows();
@@ -100,7 +108,7 @@ pub(crate) fn settle(
         if let Some(spare) = repair::tight_already(near, &|_| spare_columns, solution, exact) {
             return lowest::lowest(near, &spare, solution, exact, should_continue);
         }
-    } else if components::has_no_cycle(near, tolerance, solution) {
+    } else if components::has_no_cycle(near, tolerance, solution, memory) {
         // Most problems end here.
         return Ok(());
     }

@@ -48,6 +48,18 @@ pub enum Obstacle {
     NotOpen,
 }
 
+impl Obstacle {
+    /// What a member is told that has two pairs. First what would work at another time.
+    pub(crate) fn worse(one: Option<Self>, other: Option<Self>) -> Option<Self> {
+        match (one, other) {
+            (None, _) | (_, None) => None,
+            (Some(Self::Late), _) | (_, Some(Self::Late)) => Some(Self::Late),
+            (Some(Self::NotOpen), _) | (_, Some(Self::NotOpen)) => Some(Self::NotOpen),
+            (forbidden, _) => forbidden,
+        }
+    }
+}
+
 /// An assigned pair.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PairTerms {
@@ -80,7 +92,7 @@ impl Problem {
     }
 
     /// Costs are powers of distances: no words of time, no weights.
-    fn untimed(&self) -> bool {
+    pub(crate) fn untimed(&self) -> bool {
         !self.terms.timed() && self.terms.weights.is_empty()
     }
 
@@ -175,7 +187,7 @@ impl Problem {
                 longest = if *cost < f64::INFINITY { longest.max(*cost) } else { longest };
             }
         }
-        let unserved = if weighted && terms.weighted() { powered(UNSERVED * longest, terms.power) } else { 0.0 };
+        let unserved = if weighted && terms.weighted() { self.unserved_at(longest) } else { 0.0 };
         for row in costs.chunks_exact_mut(self.goal_count) {
             for (goal, cost) in row.iter_mut().enumerate().filter(|(_, cost)| **cost < f64::INFINITY) {
                 *cost = powered(*cost, terms.power) - unserved;
@@ -185,6 +197,11 @@ impl Problem {
             }
         }
         unserved
+    }
+
+    /// What a place without an agent costs per unit of weight where the longest way takes this time.
+    pub(crate) fn unserved_at(&self, longest: f64) -> f64 {
+        powered(UNSERVED * longest, self.terms.power)
     }
 
     /// First place of every goal, `[G + 1]`.
@@ -267,15 +284,20 @@ impl Problem {
     /// `None` if there is more to say.
     pub(crate) fn without_matrix(&self) -> Option<Vec<(u32, u32, f64)>> {
         let terms = &self.terms;
-        let plain = terms.capacities.is_empty() && !terms.forbids() && self.untimed();
-        (plain && self.matrix.is_none() && !self.only_overrides && self.dims > 0).then(|| {
+        self.positions_only().then(|| {
             let priced = self.overrides.iter().map(|&(agent, goal, cost)| (agent, goal, powered(cost, terms.power)));
             priced.chain(self.forbidden.iter().map(|&(agent, goal)| (agent, goal, f64::INFINITY))).collect()
         })
     }
 
+    /// Whether pairs cost powers of distances, but for those with a cost of their own.
+    pub(crate) fn positions_only(&self) -> bool {
+        let plain = self.terms.capacities.is_empty() && !self.terms.forbids() && self.untimed();
+        plain && self.matrix.is_none() && !self.only_overrides && self.dims > 0
+    }
+
     /// Why a pair is impossible; `base` stands for its distance.
-    fn obstacle(&self, agent: usize, goal: usize, base: f64) -> Option<Obstacle> {
+    pub(crate) fn obstacle(&self, agent: usize, goal: usize, base: f64) -> Option<Obstacle> {
         if base == f64::INFINITY {
             Some(Obstacle::Forbidden)
         } else if !self.terms.open(goal) {
@@ -289,20 +311,13 @@ impl Problem {
     pub(crate) fn obstacles(&self) -> [Vec<Option<Obstacle>>; 2] {
         let mut base = Vec::new();
         self.base_into(1.0, &mut base);
-        // Told first: it would work at another time.
-        let worse = |one: Option<Obstacle>, other: Option<Obstacle>| match (one, other) {
-            (None, _) | (_, None) => None,
-            (Some(Obstacle::Late), _) | (_, Some(Obstacle::Late)) => Some(Obstacle::Late),
-            (Some(Obstacle::NotOpen), _) | (_, Some(Obstacle::NotOpen)) => Some(Obstacle::NotOpen),
-            (forbidden, _) => forbidden,
-        };
         let mut agents = vec![Some(Obstacle::Forbidden); self.agent_count];
         let mut goals = vec![Some(Obstacle::Forbidden); self.goal_count];
         for (agent, row) in base.chunks_exact(self.goal_count.max(1)).enumerate() {
             for (goal, &d) in row.iter().enumerate() {
                 let found = self.obstacle(agent, goal, d);
-                agents[agent] = worse(agents[agent], found);
-                goals[goal] = worse(goals[goal], found);
+                agents[agent] = Obstacle::worse(agents[agent], found);
+                goals[goal] = Obstacle::worse(goals[goal], found);
             }
         }
         // An agent that is pinned waits for its goal.

@@ -8,11 +8,12 @@ mod sticky;
 
 use crate::UNASSIGNED;
 use crate::costs::{Obstacle, PairTerms};
+use crate::lists::{LARGE_CELLS, Listed};
 use crate::problem::Problem;
 use magex_assign::random::random_allowed;
 use magex_assign::{
-    AssignError, BottleneckSolver, PointProblem, Solver, Switching, bottleneck_points, compensated_sum, greedy, pairs,
-    solve_points,
+    AllowedPairs, AssignError, BottleneckSolver, PointProblem, Solver, Switching, bottleneck_points, compensated_sum,
+    greedy, pairs, solve_pairs, solve_points,
 };
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
@@ -22,7 +23,7 @@ use std::cell::RefCell;
 pub const GAP_CELLS: usize = 1_000_000;
 
 /// Buffers of larger problems are freed at once.
-const KEPT_CELLS: usize = 300_000;
+const KEPT_CELLS: usize = LARGE_CELLS;
 
 /// An answer: a valid matching.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -81,11 +82,16 @@ pub fn solve(
     if problem.cells() == 0 {
         return Ok(nothing(problem, kind));
     }
-    if matches!(kind, AssignmentMethod::Exact | AssignmentMethod::Learned | AssignmentMethod::Makespan)
-        && problem.cells() > KEPT_CELLS
-        && let Some(costs) = problem.without_matrix()
-    {
-        return solve_large(problem, kind, &costs, should_continue);
+    if problem.cells() > LARGE_CELLS {
+        let exact = matches!(kind, AssignmentMethod::Exact | AssignmentMethod::Learned);
+        if exact && let Some(listed) = problem.listed() {
+            return solve_listed(problem, &listed, should_continue);
+        }
+        if (exact || kind == AssignmentMethod::Makespan)
+            && let Some(costs) = problem.without_matrix()
+        {
+            return solve_large(problem, kind, &costs, should_continue);
+        }
     }
     with_workspace(problem, |workspace| {
         let (rows, cols) = (problem.agent_count, problem.place_count());
@@ -173,7 +179,36 @@ fn solve_large(
         }
     }
     if problem.forbids() && pairs_of < problem.agent_count.max(problem.goal_count) {
-        plan.obstacles = problem.obstacles();
+        plan.obstacles = problem.obstacles_without_matrix();
+    }
+    Ok(plan)
+}
+
+/// Solves a large team of listed pairs exactly, without a matrix.
+fn solve_listed(problem: &Problem, listed: &Listed, should_continue: &dyn Fn() -> bool) -> Result<Plan, AssignError> {
+    let (rows, cols) = (problem.agent_count, problem.goal_count);
+    let switching = Switching { current: &problem.current, cost: problem.switching_cost };
+    let own = AllowedPairs { rows, cols, pairs: &listed.pairs, switching: Switching::default() };
+    let answer = solve_pairs(&AllowedPairs { switching, ..own }, should_continue)?;
+    let pairs_of = answer.pairs().count();
+    let cost_of = |goal_of: &[u32], pairs: &[PairTerms]| total(pairs, unserved(problem, listed.unserved, goal_of));
+    let mut plan = Plan { goal_of: answer.col_of_row, scheduler: AssignmentMethod::Exact, ..Plan::default() };
+    plan.pairs = problem.pair_terms(&plan.goal_of);
+    plan.unserved_cost = unserved(problem, listed.unserved, &plan.goal_of);
+    plan.cost = cost_of(&plan.goal_of, &plan.pairs);
+    if !sticky(problem) {
+        plan.exact_cost = Some(plan.cost);
+    } else if problem.cells() <= GAP_CELLS {
+        match solve_pairs(&own, should_continue) {
+            Ok(exact) if exact.pairs().count() == pairs_of => {
+                plan.exact_cost = Some(cost_of(&exact.col_of_row, &problem.pair_terms(&exact.col_of_row)));
+            }
+            Ok(_) | Err(AssignError::Interrupted) => {}
+            Err(other) => return Err(other),
+        }
+    }
+    if pairs_of < rows.max(cols) {
+        plan.obstacles = problem.obstacles_without_matrix();
     }
     Ok(plan)
 }

@@ -13,6 +13,7 @@ pub mod clock;
 pub mod costs;
 pub mod disk;
 pub mod engine;
+mod lists;
 pub mod mission;
 pub mod missions;
 pub mod problem;

@@ -165,6 +165,7 @@ impl Problem {
             goal_ids,
         };
         problem.check()?;
+        problem.check_memory()?;
         Ok(problem)
     }
 

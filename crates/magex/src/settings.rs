@@ -41,6 +41,10 @@ pub(crate) struct Overrides {
     /// Team size; side, horizon and layout follow it [task.agents].
     #[arg(long, value_name = "N", value_parser = options::whole::<usize>(1, AGENTS_MAX as u64))]
     pub(crate) agents: Option<usize>,
+    /// Exponent of the distances that the exact and makespan schedulers sum; 2.1 lets the last agent arrive sooner
+    /// [commander.power].
+    #[arg(long, value_name = "P", value_parser = options::number::<f64>(1.0, 16.0))]
+    pub(crate) power: Option<f64>,
     /// Starts: uniform, lines, lines-0..3, authors or authors-0..3 [task.spawn].
     #[arg(long, value_name = "MODE")]
     pub(crate) spawn: Option<Spawn>,
@@ -73,6 +77,7 @@ impl Overrides {
         run.target_sampled_success = self.target_sampled_success.unwrap_or(run.target_sampled_success);
         run.target_collisions = self.target_collisions.unwrap_or(run.target_collisions);
         config.executor.kind = self.executor.unwrap_or(config.executor.kind);
+        config.commander.power = self.power.unwrap_or(config.commander.power);
         if let Some(agents) = self.agents {
             config = config.resized(agents);
         }
@@ -172,6 +177,15 @@ mod tests {
         assert_eq!((config.run.seed, config.run.max_steps), (9, 77));
         assert_eq!(config.executor.kind, ExecutorKind::Local);
         assert_eq!(config.task, file.task);
+    }
+
+    #[test]
+    fn a_power_is_for_schedulers_that_know_one() {
+        let options = Overrides { power: Some(2.1), ..Overrides::default() };
+        let refused = options.apply(RunConfig::default()).unwrap_err().to_string();
+        assert!(refused.contains("commander.power"), "{refused}");
+        let exact = RunConfig::from_toml("[commander]\nkind = \"exact\"").unwrap();
+        assert_eq!(options.apply(exact).unwrap().commander.power, 2.1);
     }
 
     #[test]

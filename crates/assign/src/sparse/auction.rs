@@ -1,18 +1,23 @@
 //! Nearly the final prices: rows bid for their cheapest column, and a row that is outbid bids again.
 
 use super::NONE;
-use super::candidates::{Candidates, Engine};
+use super::candidates::{COUNT, Candidates, Engine};
 use crate::AssignError;
 
 /// Bids per row and stage, at most: what is left then is the shortest paths' work.
 const BIDS: usize = 40;
 /// ε falls by this from stage to stage.
 const FALL: f64 = 0.2;
-/// Stages from [`NEAR`] mean differences between the cheapest and the second cheapest column on; before them, as many as lead
-/// there from the largest cost / [`FAR`], the scale on which clusters compete.
+/// Stages from [`NEAR`] mean differences between the cheapest and the second cheapest column on.
 const STAGES: usize = 8;
 const NEAR: f64 = 30.0;
+/// Where that is too little, because clusters compete that are far apart, a stage with so many bids per row leaves rows over:
+/// then ε begins [`RISE`] stages higher, up to the largest cost / [`FAR`].
+const TRIAL: usize = 12;
+const RISE: usize = 2;
 const FAR: f64 = 16.0;
+/// Candidates that are looked up at once while most bids need others: fewer are found sooner.
+const FEW: usize = 8;
 
 impl<C: Candidates> Engine<C> {
     /// Gives most rows a column that is one of their cheapest. With as many rows as columns, stages of falling ε; otherwise a
@@ -23,14 +28,23 @@ impl<C: Candidates> Engine<C> {
         if rows == self.row_of_col.len() && rows > 1 {
             let mut epsilon = self.first_epsilon();
             let mut stages = STAGES;
+            self.count = FEW;
             while epsilon * FAR < self.source.largest_cost() && stages < 2 * STAGES {
-                (epsilon, stages) = (epsilon / FALL, stages + 1);
+                self.bid(&mut free, epsilon, TRIAL * rows, should_continue)?;
+                if free.is_empty() {
+                    break;
+                }
+                epsilon /= FALL.powi(RISE as i32);
+                stages += RISE;
             }
             for _ in 0..stages {
+                let (bids, looks) = (self.bids, self.looks);
                 self.bid(&mut free, epsilon, BIDS * rows, should_continue)?;
+                self.count = if 2 * (self.looks - looks) > self.bids - bids { FEW } else { COUNT };
                 epsilon *= FALL;
                 self.free_unless_best(&mut free, epsilon);
             }
+            self.count = COUNT;
             self.free_unless_best(&mut free, 0.0);
         }
         self.bid(&mut free, 0.0, 4 * rows, should_continue)
@@ -77,6 +91,10 @@ impl<C: Candidates> Engine<C> {
             }
             let mut row = first;
             loop {
+                self.bids += 1;
+                if self.bids.is_multiple_of(256) && !should_continue() {
+                    return Err(AssignError::Interrupted);
+                }
                 let best = self.best(row);
                 if best.col as usize >= self.cols() {
                     (self.col_of_row[row as usize], self.row_of_col[best.col as usize]) = (best.col, row);

@@ -3,7 +3,7 @@
 use super::NONE;
 use super::tree::Found;
 
-/// Candidates that are looked up at once.
+/// Candidates that are looked up at once, as a rule.
 pub(super) const COUNT: usize = 16;
 
 /// Where the columns of a row come from.
@@ -24,8 +24,8 @@ pub(super) trait Candidates {
     fn reopen(&mut self, col: u32);
     /// Appends every column of a row with cost − price up to `limit`.
     fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>);
-    /// The prices have fallen.
-    fn reprice(&mut self, price: &[f64]);
+    /// The price of a column has fallen from `before`.
+    fn reprice(&mut self, col: u32, before: f64, price: &[f64]);
     /// Cost of a pair that was found.
     fn cost(&self, row: u32, col: u32) -> f64;
 }
@@ -58,9 +58,12 @@ pub(super) struct Engine<C> {
     pub(super) col_of_row: Vec<u32>,
     /// `[cols]`, and `[rows]` more where rows may be without a column.
     pub(super) row_of_col: Vec<u32>,
-    /// Price changes of which the source does not know.
-    changes: usize,
     pub(super) found: Vec<Found>,
+    /// Candidates that are looked up at once.
+    pub(super) count: usize,
+    /// How often that happened, and how often a row bid.
+    pub(super) looks: usize,
+    pub(super) bids: usize,
 }
 
 impl<C: Candidates> Engine<C> {
@@ -72,8 +75,10 @@ impl<C: Candidates> Engine<C> {
             price: vec![0.0; cols],
             col_of_row: vec![NONE; rows],
             row_of_col: vec![NONE; cols + sinks],
-            changes: 0,
             found: Vec::new(),
+            count: COUNT,
+            looks: 0,
+            bids: 0,
             source,
         }
     }
@@ -84,21 +89,13 @@ impl<C: Candidates> Engine<C> {
 
     /// Changes a price.
     pub(super) fn set_price(&mut self, col: u32, price: f64) {
-        self.price[col as usize] = price;
-        self.changes += 1;
-    }
-
-    /// Brings the source's prices up to date, if more than a given number have changed.
-    pub(super) fn reprice(&mut self, most: usize) {
-        if self.changes > most {
-            self.source.reprice(&self.price);
-            self.changes = 0;
-        }
+        let before = std::mem::replace(&mut self.price[col as usize], price);
+        self.source.reprice(col, before, &self.price);
     }
 
     /// Looks up the cheapest columns of a row anew.
     pub(super) fn look_up(&mut self, row: u32, count: usize) {
-        self.reprice(self.price.len() / 8);
+        self.looks += 1;
         let list = &mut self.lists[row as usize];
         list.bound = self.source.nearest(row, count, &self.price, &mut self.found);
         list.entries.clear();
@@ -107,7 +104,7 @@ impl<C: Candidates> Engine<C> {
 
     /// The best choice of a row; a column without a row first among equals.
     pub(super) fn best(&mut self, row: u32) -> Best {
-        let mut count = COUNT;
+        let mut count = self.count;
         loop {
             let mut best = Best { col: NONE, least: f64::INFINITY, second: f64::INFINITY };
             let list = &self.lists[row as usize];
@@ -165,10 +162,6 @@ impl<C: Candidates> Engine<C> {
             let up_to = |entry: &&(u32, f64)| entry.1 - price[entry.0 as usize] <= limit;
             near.extend(list.entries.iter().filter(up_to).map(|entry| entry.0));
         } else {
-            if self.changes > 0 {
-                self.source.reprice(&self.price);
-                self.changes = 0;
-            }
             self.source.within(row, limit, &self.price, near);
         }
         let mut least = f64::INFINITY;

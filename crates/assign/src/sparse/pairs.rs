@@ -167,7 +167,7 @@ impl Candidates for &List {
         found.extend(self.of(row as usize).iter().filter(near).map(|pair| pair.0));
     }
 
-    fn reprice(&mut self, _: &[f64]) {}
+    fn reprice(&mut self, _: u32, _: f64, _: &[f64]) {}
 
     fn cost(&self, row: u32, col: u32) -> f64 {
         let cost = self.get(row as usize, col as usize).unwrap_or(f64::INFINITY);

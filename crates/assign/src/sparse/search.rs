@@ -7,9 +7,6 @@ use crate::greedy::ascending;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// Prices that may be out of date in the source when a search begins: it looks up more than they would cost.
-const REPRICED: usize = 64;
-
 /// What the search knows of each column and row; a stamp says in which search.
 struct Known {
     stamp: u32,
@@ -45,7 +42,6 @@ impl<C: Candidates> Engine<C> {
                     return Err(AssignError::Interrupted);
                 }
                 known.stamp += 2;
-                self.reprice(REPRICED);
                 known.heap.clear();
                 known.finals.clear();
                 known.closed = 0;

@@ -129,3 +129,58 @@ fn bad_points_and_pairs_are_refused_and_named() {
     assert!(pairs(&[(1, 0, 0.0)]).is_err());
     assert_eq!(pairs(&[]).unwrap().col_of_row, [UNASSIGNED]);
 }
+
+/// Points on a line, where most pairs may be tight: whole numbers, doubles whose differences are doubles, tenths, whose are not,
+/// and a line along no axis.
+fn on_a_line(chance: &mut Stream, count: usize, kind: u32, dims: usize) -> Vec<f64> {
+    let along = (kind % 3) as usize % dims;
+    let mut points = Vec::new();
+    for _ in 0..count {
+        let x = match kind {
+            0 => f64::from(chance.below(1 + count as u32 / 4)) - 3.0,
+            1 => chance.uniform() - if chance.below(2) == 0 { 0.5 } else { 0.0 },
+            2 => f64::from(chance.below(40)) * 0.1,
+            _ => f64::from(chance.below(count as u32)),
+        };
+        points.extend((0..dims).map(|axis| if axis == along || kind == 3 { x * (axis + 1) as f64 } else { 7.25 }));
+    }
+    points
+}
+
+#[test]
+fn points_on_a_line_have_the_answer_of_the_matrix() {
+    let mut solver = Solver::default();
+    let many = if cfg!(debug_assertions) { 400 } else { 4000 };
+    for index in 0..many + 6 {
+        let mut chance = Key::new(25, Purpose::Bench, &[index]).stream();
+        let (kind, dims) = (chance.below(4), 1 + chance.below(3) as usize);
+        let rows = 1 + chance.below(if index < many { 12 } else { 200 }) as usize;
+        let cols = if chance.below(4) == 0 { rows + chance.below(3) as usize } else { rows };
+        let agents = on_a_line(&mut chance, rows, kind, dims);
+        let goals = on_a_line(&mut chance, cols, kind, dims);
+        let problem = PointProblem::new(&agents, &goals, dims);
+        let cost = matrix(&problem).unwrap();
+        let expected = solver.solve_switching(&cost, rows, cols, &problem.switching, &|| true).unwrap();
+        let found = solve_sparse(&problem, rows, cols, Limit::NONE, &|| true).unwrap();
+        assert_eq!(found, expected, "line {index}: kind {kind}, {rows} by {cols} in {dims} dimensions");
+    }
+}
+
+#[test]
+fn twenty_thousand_points_on_a_line_or_at_one_place_are_solved() {
+    let mut chance = Key::new(26, Purpose::Bench, &[]).stream();
+    let mut line = || -> Vec<f64> { (0..20_000).map(|_| f64::from(chance.below(5000))).collect() };
+    let (agents, goals) = (line(), line());
+    let answer = super::solve_points(&PointProblem::new(&agents, &goals, 1), &|| true).unwrap();
+    let (mut a, mut g) = (agents.clone(), goals.clone());
+    a.sort_unstable_by(f64::total_cmp);
+    g.sort_unstable_by(f64::total_cmp);
+    assert_eq!(answer.cost, a.iter().zip(&g).map(|(a, g)| (a - g).abs()).sum::<f64>());
+    let same = vec![2.5; 20_000];
+    let answer = super::solve_points(&PointProblem::new(&same, &same, 1), &|| true).unwrap();
+    assert!(answer.col_of_row.iter().copied().eq(0..20_000));
+    assert_eq!(
+        super::solve_points(&PointProblem::new(&same, &same, 1), &|| false),
+        Err(crate::AssignError::Interrupted)
+    );
+}

@@ -35,6 +35,7 @@ pub(super) struct Tree<const D: usize> {
     closed: Vec<bool>,
     open: Vec<u32>,
     stack: Vec<(u32, f64)>,
+    path: Vec<u32>,
 }
 
 impl<const D: usize> Tree<D> {
@@ -49,6 +50,7 @@ impl<const D: usize> Tree<D> {
             closed: vec![false; points.len()],
             open,
             stack: Vec::new(),
+            path: Vec::new(),
         };
         tree.split(points, &mut order, 0);
         tree.points = order.iter().map(|&point| points[point as usize]).collect();
@@ -98,16 +100,38 @@ impl<const D: usize> Tree<D> {
         &self.points
     }
 
-    /// Brings the largest prices up to date; `price` is in the tree's order.
-    pub(super) fn reprice(&mut self, price: &[f64]) {
-        for place in (0..self.nodes.len()).rev() {
-            let Node { start, end, second, .. } = self.nodes[place];
-            self.nodes[place].largest_price = if second == 0 {
-                price[start as usize..end as usize].iter().fold(f64::NEG_INFINITY, |a, &b| if b > a { b } else { a })
-            } else {
-                let (one, other) = (self.nodes[place + 1].largest_price, self.nodes[second as usize].largest_price);
-                if other > one { other } else { one }
-            };
+    /// Brings the largest prices up to date after the price of a point has fallen from `before`; `price` is in the tree's order.
+    pub(super) fn reprice(&mut self, point: u32, before: f64, price: &[f64]) {
+        self.path.clear();
+        let mut place = 0;
+        loop {
+            let second = self.nodes[place as usize].second;
+            if second == 0 {
+                break;
+            }
+            self.path.push(place);
+            place = if point < self.nodes[second as usize].start { place + 1 } else { second };
+        }
+        let Node { start, end, largest_price, .. } = self.nodes[place as usize];
+        if largest_price > before {
+            return;
+        }
+        let mut largest = f64::NEG_INFINITY;
+        price[start as usize..end as usize]
+            .iter()
+            .for_each(|&price| largest = if price > largest { price } else { largest });
+        loop {
+            let node = &mut self.nodes[place as usize];
+            if node.largest_price == largest {
+                return;
+            }
+            node.largest_price = largest;
+            let Some(parent) = self.path.pop() else { return };
+            let second = self.nodes[parent as usize].second;
+            let (one, other) =
+                (self.nodes[parent as usize + 1].largest_price, self.nodes[second as usize].largest_price);
+            largest = if other > one { other } else { one };
+            place = parent;
         }
     }
 

@@ -1,14 +1,21 @@
 //! Cycles of the graph in which a row points at the owners of its nearly tight columns.
 
-use super::{Graph, NONE, Solution};
+use super::{Graph, Memory, NONE, Solution};
 
 /// Whether the solution is the only optimum. The pool, which owns the columns without a row, points at the rows whose columns
 /// may stay alone.
-pub(super) fn has_no_cycle(near: &Graph, tolerance: f64, solution: &Solution<'_>) -> bool {
+pub(super) fn has_no_cycle(near: &Graph, tolerance: f64, solution: &Solution<'_>, memory: &mut Memory) -> bool {
     let rows = near.rows();
+    let pooled = pooled(tolerance, solution);
+    if near.cols.len() == rows {
+        // Every row has its own column alone.
+        return true;
+    }
     let pool = rows;
     let owner = |col: u32| solution.row_of_col[col as usize];
-    let mut degree = vec![0u32; rows + 1];
+    let Memory { degree, ready } = memory;
+    degree.clear();
+    degree.resize(rows + 1, 0);
     for (row, _) in solution.col_of_row.iter().enumerate() {
         for &col in near.of(row) {
             let owner = owner(col);
@@ -17,10 +24,10 @@ pub(super) fn has_no_cycle(near: &Graph, tolerance: f64, solution: &Solution<'_>
             }
         }
     }
-    let pooled = pooled(tolerance, solution);
     pooled.iter().for_each(|&row| degree[row as usize] += 1);
     // Takes away what nothing points at, until nothing is left or only cycles are.
-    let mut ready: Vec<u32> = (0..=pool as u32).filter(|&node| degree[node as usize] == 0).collect();
+    ready.clear();
+    ready.extend((0..=pool as u32).filter(|&node| degree[node as usize] == 0));
     let mut taken = 0;
     while let Some(node) = ready.pop() {
         taken += 1;
