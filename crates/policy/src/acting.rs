@@ -147,11 +147,11 @@ impl TeamPolicy {
         state: &JointState<'_>,
         memory: Vec<f32>,
         choice: Choice,
-    ) -> Result<(Decision, Features), ActError> {
+    ) -> Result<(Decision, Arc<Features>), ActError> {
         let shape = self.task.shape(1);
         let n = shape.agents;
         let teams = state.positions.len() / (shape.bodies * shape.dims);
-        let features = self.model.spec().compute(state);
+        let features = Arc::new(self.model.spec().compute(state));
         let mut streams = (choice.mode == Mode::Sampled)
             .then(|| (0..teams as u32).map(|t| Key::new(choice.seed, Purpose::Request, &[t]).stream()).collect());
         let noise = match &mut streams {
