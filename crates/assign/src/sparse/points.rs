@@ -134,12 +134,11 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
     let metric = Metric { power: problem.power, limit: limit.cost };
     let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
     let own = own_costs(problem, &agents, &goals, metric);
-    if own.is_empty() && problem.power == 1.0 && limit.cost == f64::INFINITY {
-        if let Some(goal_of) = line::solve(&agents, &goals, should_continue) {
-            let goal_of = goal_of?;
-            let cost = crate::pairs(&goal_of).map(|(agent, goal)| metric.cost(&agents[agent], &goals[goal]));
-            return Ok(Assignment { cost: compensated_sum(cost), col_of_row: goal_of });
-        }
+    let plain = own.is_empty() && problem.power == 1.0 && limit.cost == f64::INFINITY;
+    if plain && let Some(goal_of) = line::solve(&agents, &goals, should_continue) {
+        let goal_of = goal_of?;
+        let cost = crate::pairs(&goal_of).map(|(agent, goal)| metric.cost(&agents[agent], &goals[goal]));
+        return Ok(Assignment { cost: compensated_sum(cost), col_of_row: goal_of });
     }
     let (largest_cost, sink) = largest_costs(&own, &agents, &goals, metric)?;
     let sink = sink.filter(|_| !limit.complete);
