@@ -44,6 +44,8 @@ SUBJECTS = {
 FREE = ("magex", "local", "magex-literal", "attention")
 SENSITIVE = 1e-5
 MOST = 1e-5
+# MAGE-X takes the first of the largest log-probabilities, which rounding makes equal for logits this close.
+TIE = 5e-7
 
 
 def magex(program, *arguments):
@@ -129,7 +131,7 @@ class Tally:
         self.worst = max(self.worst, float(difference.max()))
         for k, part in enumerate(np.split(ours, np.cumsum(choices)[:-1], 1)):
             ranked = np.sort(part, 1)
-            lead = ranked[:, -1] - ranked[:, -2] > np.maximum(2 * difference, 1e-9)
+            lead = ranked[:, -1] - ranked[:, -2] > np.maximum(2 * difference, TIE)
             self.wrong += int((lead & (actions[:, k] != trace["actions"][t][:, k])).sum())
 
 

@@ -67,8 +67,7 @@ pub fn check(bytes: &[u8], config: &RunConfig) -> Result<Vec<String>, ParamError
     }
     let file = safetensors::SafeTensors::deserialize(bytes)?;
     let known = known(config)?;
-    let extra: Vec<&str> = file.names().into_iter().filter(|name| !known.contains(*name)).collect();
-    let extra: BTreeSet<&str> = extra.into_iter().collect();
+    let extra: BTreeSet<&str> = file.names().into_iter().filter(|name| !known.contains(*name)).collect();
     if !extra.is_empty() {
         let names: Vec<&str> = extra.iter().take(3).copied().collect();
         let more = if extra.len() > 3 { format!(" and {} more", extra.len() - 3) } else { String::new() };
