@@ -75,7 +75,7 @@ impl Inputs<'_> {
     fn within(g: &mut Builder, x: &str, limit: f32) -> Value {
         let limit = g.scalar(limit);
         let within = g.op("LessOrEqual", &[x, &limit]);
-        g.to_float(&within)
+        g.cast_float(&within)
     }
 
     /// x / max(d, least)
@@ -163,7 +163,7 @@ impl Inputs<'_> {
         let shape = g.op("Shape", &[&self.positions]);
         let at = g.ints(&[1], &[1]);
         let n = g.gather(&shape, &at, 0);
-        g.to_float(&n)
+        g.cast_float(&n)
     }
 
     /// The k nearest bodies [B, N, k, width], and 1 for those that exist, [B, N, k, 1].
@@ -182,7 +182,7 @@ impl Inputs<'_> {
         let mut hidden = self.diagonal(g);
         if self.balls.is_some() {
             // An agent's own ball has its index.
-            let (both, zero) = (g.to_float(&hidden), g.scalar(0.5));
+            let (both, zero) = (g.cast_float(&hidden), g.scalar(0.5));
             let both = g.concat(1, &[&both, &both]);
             hidden = g.op("Greater", &[&both, &zero]);
         }
@@ -207,7 +207,7 @@ impl Inputs<'_> {
         let exists = g.op("Less", &[&nearest, &end]);
         let first = g.ints(&[], &[0]);
         let index = g.choose(&exists, &index, &first);
-        let exists = g.to_float(&exists);
+        let exists = g.cast_float(&exists);
         let exists = g.unsqueeze(&exists, -1);
         let (p, v) = (g.pick(&p, &index, 1), g.pick(&v, &index, 1));
         let (offset, own) = (g.sub(&p, &tall), g.unsqueeze(&self.velocities, 2));
@@ -239,7 +239,7 @@ impl Inputs<'_> {
             let at = g.ints(&[1], &[1]);
             let n = g.gather(&shape, &at, 0);
             let ball = g.op("GreaterOrEqual", &[&index, &n]);
-            let ball = g.to_float(&ball);
+            let ball = g.cast_float(&ball);
             parts.push(g.unsqueeze(&ball, -1));
         }
         let parts: Vec<&str> = parts.iter().map(String::as_str).collect();

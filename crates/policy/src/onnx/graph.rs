@@ -226,7 +226,7 @@ impl Builder {
         (values, indices)
     }
 
-    pub(super) fn to_float(&mut self, x: &str) -> Value {
+    pub(super) fn cast_float(&mut self, x: &str) -> Value {
         self.with("Cast", &[x], vec![number("to", FLOAT.into())])
     }
 

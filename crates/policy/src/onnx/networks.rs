@@ -150,7 +150,7 @@ impl Networks<'_> {
             let zero = g.scalar(0.0);
             let edges = g.op("Greater", &[&logits, &zero]);
             let edges = g.op("And", &[&edges, &others]);
-            let edges = g.to_float(&edges);
+            let edges = g.cast_float(&edges);
             let degree = g.sum(&edges, -1, true);
             let degree = g.at_least(&degree, 1.0);
             let message = g.matmul(&edges, &parts[2]);
@@ -278,7 +278,7 @@ impl Networks<'_> {
             let range: Vec<i64> = (0..size as i64).collect();
             let range = g.ints(&[size], &range);
             let equal = g.op("Equal", &[&best, &range]);
-            chosen.push(g.to_float(&equal));
+            chosen.push(g.cast_float(&equal));
         }
         let chosen: Vec<&str> = chosen.iter().map(String::as_str).collect();
         g.concat(-1, &chosen)
