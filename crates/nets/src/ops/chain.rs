@@ -131,6 +131,7 @@ pub struct Chain {
 }
 
 /// Collects the branches and layers of a chain, and the names of its parameters.
+#[derive(Default)]
 pub struct ChainBuilder {
     layout: Layout,
     members: Vec<(String, Vec<usize>, Init)>,
@@ -140,7 +141,7 @@ pub struct ChainBuilder {
 impl ChainBuilder {
     /// Without a branch.
     pub fn new() -> Self {
-        Self { layout: Layout::default(), members: Vec::new(), count: 0 }
+        Self::default()
     }
 
     fn member(&mut self, name: String, shape: &[usize], init: Init) -> usize {

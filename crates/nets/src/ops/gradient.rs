@@ -37,8 +37,8 @@ impl Gradient {
         let mut first = 0;
         while first < rows {
             let count = BLOCK.min(rows - first);
-            let x = x.from_column(first * x.stride);
-            let dz = dz.from_column(first * dz.stride);
+            let x = x.skip(first * x.stride);
+            let dz = dz.skip(first * dz.stride);
             for v in (0..padded).step_by(LANES) {
                 let mut sum = load(&self.db[v..]);
                 for row in dz.values.chunks(dz.stride).take(count) {
@@ -78,7 +78,7 @@ fn block(x: Rows<'_>, k: usize, dz: Rows<'_>, width: usize, sums: &mut [f32], ro
     let mut column = 0;
     while column < width {
         let left = most.min((width - column) / LANES);
-        let dz = dz.from_column(column);
+        let dz = dz.skip(column);
         if left >= 4 {
             columns::<4>(x, k, dz, &mut sums[column..], width, rows);
             column += 4 * LANES;
@@ -96,7 +96,7 @@ fn block(x: Rows<'_>, k: usize, dz: Rows<'_>, width: usize, sums: &mut [f32], ro
 fn columns<const Q: usize>(x: Rows<'_>, k: usize, dz: Rows<'_>, sums: &mut [f32], width: usize, rows: usize) {
     let mut i = 0;
     while i < k {
-        let (left, x, sums) = (k - i, x.from_column(i), &mut sums[i * width..]);
+        let (left, x, sums) = (k - i, x.skip(i), &mut sums[i * width..]);
         i += if WIDE && Q < 4 && left >= 8 {
             tile8::<Q>(x, dz, sums, width, rows);
             8

@@ -55,8 +55,8 @@ impl<'a> Rows<'a> {
         Self { values, stride }
     }
 
-    /// From column `column` on.
-    pub(crate) fn from_column(self, column: usize) -> Self {
+    /// Without the first `column` numbers.
+    pub(crate) fn skip(self, column: usize) -> Self {
         Self { values: &self.values[column..], ..self }
     }
 }

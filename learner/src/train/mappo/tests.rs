@@ -171,7 +171,13 @@ fn threads_do_not_reach_a_number_and_the_first_ratio_is_exactly_one() {
         config.collect.shards_per_iteration = 1;
         config.collect.episodes_per_iteration = 6;
         let mappo = Mappo::new(&config.validated().unwrap()).unwrap();
-        let fresh = || Learned { networks: mappo.init().unwrap(), value_norm: mappo.value_norm(), replay: None };
+        let about = About::of(&mappo.config);
+        let fresh = || Learned {
+            networks: mappo.init().unwrap(),
+            value_norm: mappo.value_norm(),
+            replay: None,
+            about: about.clone(),
+        };
         let batch = anywhere(&mappo, &fresh(), 6);
         let run = |threads: usize| {
             let mut learned = fresh();

@@ -25,7 +25,7 @@ impl Qmix {
         let errors =
             trajectories.par_iter().map(|t| self.worst_action(&agent, t)).collect::<CandleResult<Vec<f64>>>()?;
         let limit = LOG_PROB_TOLERANCE;
-        match errors.iter().position(|&error| !(error <= limit)) {
+        match errors.iter().position(|&error| error > limit) {
             Some(trajectory) => Err(Suspect { trajectory, field: "actions", error: errors[trajectory], limit }.into()),
             None => Ok(()),
         }

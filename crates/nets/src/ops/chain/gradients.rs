@@ -93,7 +93,7 @@ impl Op {
                             slope_in_place(dense.act, &first[at..at + width], &mut d[column..]);
                         }
                     }
-                    let d = Rows::new(d, stride).from_column(column);
+                    let d = Rows::new(d, stride).skip(column);
                     let k = dense.k;
                     gradient.add(Rows::new(&field(&self.features)[tile.start * k..tile.end * k], k), d, rows);
                     if let Some(team) = team {
