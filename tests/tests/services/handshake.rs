@@ -26,10 +26,10 @@ async fn a_wrong_task_is_refused_with_both_sides_named() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_wrong_protocol_is_refused_with_both_sides_named() {
     let learner = Learner::start().await;
-    let hello = v1::Hello { protocol_version: 3, ..Puppet::hello() };
+    let hello = v1::Hello { protocol_version: 4, ..Puppet::hello() };
     let status = Puppet::connect(&learner.url, hello).await.unwrap().next().await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition);
-    assert!(status.message().contains("actor speaks protocol 3, learner speaks protocol 2"), "{}", status.message());
+    assert!(status.message().contains("actor speaks protocol 4, learner speaks protocol 3"), "{}", status.message());
     learner.stop().await;
 }
 

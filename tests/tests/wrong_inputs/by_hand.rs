@@ -97,7 +97,7 @@ pub(crate) fn rows() -> Vec<Row> {
         ("assign --agents [[0,0] --goals [[0,1]]", 64, &["--agents", "line 1, column"]),
         ("assign --agents [[0,0]] --goals [[0,1],5]", 64, &["--goals[1]", "5"]),
         ("assign --agents [[0,0]] --goals [[0,\"a\"]]", 64, &["--goals[0][1]", "\"a\""]),
-        ("assign --agents [[0,1e39]] --goals [[0,1]]", 64, &["--agents[0][1]", "1e+39"]),
+        ("assign --agents [[0,1e400]] --goals [[0,1]]", 64, &["--agents", "line 1, column 9"]),
         ("assign --agents [[0,null]] --goals [[0,1]]", 64, &["--agents[0][1]", "null"]),
         ("assign --agents [[0]] --goals [[0,1]]", 64, &["agents", "2 or 3"]),
         ("assign --agents [[0,0],[1,1,1]] --goals [[0,1]]", 64, &["agents[1]"]),

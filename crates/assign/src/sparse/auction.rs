@@ -11,7 +11,7 @@ const FALL: f64 = 0.2;
 /// Stages from [`NEAR`] mean differences between the cheapest and the second cheapest column on.
 const STAGES: usize = 8;
 const NEAR: f64 = 30.0;
-/// Where that is too little, because clusters compete that are far apart, a stage with so many bids per row leaves rows over:
+/// Where that is too little, because clusters compete that are far apart, a stage with [`TRIAL`] bids per row leaves rows over:
 /// then ε begins [`RISE`] stages higher, up to the largest cost / [`FAR`].
 const TRIAL: usize = 12;
 const RISE: usize = 2;

@@ -264,12 +264,6 @@ fn team(args: &AssignArgs) -> anyhow::Result<v1::AssignRequest> {
     }
     let form = "give {\"agents\": [[x, y], …], \"goals\": [[x, y], …]}, or add --goals";
     let Value::Object(team) = agents else { return Err(usage(format!("--agents: there are no goals; {form}"))) };
-    if !team.contains_key("costs") {
-        for key in ["agents", "goals"] {
-            let missing = || usage(format!("--agents: '{key}' is missing; {form}"));
-            team.get(key).map(drop).ok_or_else(missing)?;
-        }
-    }
     let mut request = v1::AssignRequest::default();
     for (key, value) in &team {
         let field = format!("--agents: {key}");
@@ -303,6 +297,13 @@ fn team(args: &AssignArgs) -> anyhow::Result<v1::AssignRequest> {
             "switching_cost" => request.switching_cost = of_json(&field, value)?,
             "power" => request.power = Some(of_json(&field, value)?),
             _ => return Err(usage(format!("--agents: unknown key '{key}'; `magex assign --help` lists them"))),
+        }
+    }
+    // After the keys: an unknown one may be the missing one, misspelt.
+    if !team.contains_key("costs") {
+        for key in ["agents", "goals"] {
+            let missing = || usage(format!("--agents: '{key}' is missing; {form}"));
+            team.get(key).map(drop).ok_or_else(missing)?;
         }
     }
     Ok(request)

@@ -36,7 +36,7 @@ pub(crate) struct ExportArgs {
     #[arg(long, value_enum, value_name = "FORMAT")]
     format: Format,
     /// The file [default: policy.onnx or policy.py in the run folder].
-    #[arg(long, short, value_name = "FILE")]
+    #[arg(long, short, value_name = "PATH")]
     out: Option<PathBuf>,
 }
 
