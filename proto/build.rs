@@ -6,7 +6,7 @@ use std::{error::Error, fs, path::PathBuf};
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let files = ["magex/v1/types.proto", "magex/v1/learner.proto", "magex/v1/commander.proto", "magex/v1/policy.proto"];
+    let files = ["types", "learner", "commander", "policy", "environment"].map(|name| format!("magex/v1/{name}.proto"));
     let descriptors = protox::compile(files, ["proto"])?;
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     fs::write(out.join("magex_descriptor.bin"), descriptors.encode_to_vec())?;
