@@ -1,0 +1,78 @@
+"""What can be wrong, as exceptions whose text is the sentence that a person reads."""
+
+from __future__ import annotations
+
+import os
+import sys
+import sysconfig
+import traceback
+
+import numpy as np
+
+RAISED, BROKE_ITS_WORD, REQUEST = 1, 2, 3
+
+_HERE = os.path.dirname(os.path.abspath(__file__)) + os.sep
+_INSTALLED = tuple({sysconfig.get_path("stdlib") + os.sep, sysconfig.get_path("purelib") + os.sep, sys.base_prefix + os.sep})
+
+
+class Refused(Exception):
+    """The environment cannot be served as it is; the text names the field and the remedy."""
+
+
+class Problem(Exception):
+    """One request failed. The stream stays usable."""
+
+    def __init__(self, kind: int, message: str, world: int | None = None) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.message = message
+        self.world = world
+
+
+def request(message: str) -> Problem:
+    """The caller's fault."""
+    return Problem(REQUEST, message)
+
+
+def broke(world: int, agent: str | None, field: str, expected: object, seen: object) -> Problem:
+    """The environment's fault: it returned what its description does not allow."""
+    who = f'world {world}, agent "{agent}"' if agent is not None else f"world {world}"
+    return Problem(BROKE_ITS_WORD, f"{who}, {field}: expected {expected}, seen {seen}", world)
+
+
+def raised(error: BaseException, during: str, world: int | None = None) -> Problem:
+    """The environment's fault: it raised an exception."""
+    who = f"world {world}, {during}" if world is not None else during
+    return Problem(RAISED, f"{who}: {describe(error)}", world)
+
+
+def describe(error: BaseException) -> str:
+    """Type, text and the place that its author can change."""
+    text = " ".join(str(error).split())
+    if len(text) > 500:
+        text = text[:500] + "…"
+    place = frame(error)
+    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
+
+
+def frame(error: BaseException) -> str:
+    """file:line of the last frame in code of the user's; of the last frame at all if there is none."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
+    own = [f for f in frames if not f.filename.startswith(_INSTALLED) and not f.filename.startswith("<")]
+    chosen = own or frames
+    return f"{chosen[-1].filename}:{chosen[-1].lineno}" if chosen else ""
+
+
+def short(value: object, limit: int = 120) -> str:
+    """A value as a person wants to see it in a sentence."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    text = " ".join(repr(value).split())
+    return text if len(text) <= limit else text[:limit] + "…"
+
+
+def names(values: object, limit: int = 8) -> str:
+    """Names of agents, or keys, sorted and not too many."""
+    texts = sorted(f'"{v}"' if isinstance(v, str) else repr(v) for v in values)  # type: ignore[attr-defined]
+    more = f" and {len(texts) - limit} more" if len(texts) > limit else ""
+    return (", ".join(texts[:limit]) + more) or "none"
