@@ -24,14 +24,14 @@ class Found:
     difference: str = ""
 
 
-def random_actions(layout: Layout, rng: np.random.Generator, batch: Batch, world: int) -> np.ndarray:
-    """[N, H or C]: a random allowed choice for every component, or random numbers within the bounds."""
+def random_actions(layout: Layout, rng: np.random.Generator, masks: np.ndarray | None) -> np.ndarray:
+    """[N, H or C]: a random choice for every component out of masks [N, H, largest], or random numbers within the bounds."""
     table = layout.actions
     if not table.discrete:
         low = np.where(np.isfinite(table.low), table.low, -1.0)
         high = np.where(np.isfinite(table.high), table.high, 1.0)
         return rng.uniform(low, high)
-    allowed = table.allowed if batch.masks is None else batch.masks[world]
+    allowed = table.allowed if masks is None else masks
     draw = rng.random(allowed.shape) * allowed
     return draw.argmax(axis=2)
 
@@ -81,7 +81,7 @@ def _episodes(worlds: Worlds, layout: Layout, seeds: tuple[int, ...], steps: int
         again: dict[int, int] = {}
         for w in range(len(seeds)):
             if batch.active[w].any():
-                actions[w] = random_actions(layout, generators[w], batch, w)
+                actions[w] = random_actions(layout, generators[w], None if batch.masks is None else batch.masks[w])
             else:
                 follow[w] += 100
                 again[w] = follow[w]

@@ -57,8 +57,8 @@ def describe(error: BaseException) -> str:
 
 def frame(error: BaseException) -> str:
     """file:line of the last frame in code of the user's; of the last frame at all if there is none."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
-    own = [f for f in frames if not f.filename.startswith(_INSTALLED) and not f.filename.startswith("<")]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith((_HERE, "<"))]
+    own = [f for f in frames if not f.filename.startswith(_INSTALLED)]
     chosen = own or frames
     return f"{chosen[-1].filename}:{chosen[-1].lineno}" if chosen else ""
 

@@ -12,7 +12,7 @@ from typing import Any
 import grpc
 import numpy as np
 
-from magex import _probe
+from magex import _check, _probe
 from magex._environment import Environment, Worlds
 from magex._layout import Batch, Layout
 from magex._problems import Problem, Refused, broke, describe, request
@@ -74,8 +74,14 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
             stream.worlds.close()
 
     def Check(self, message: pb.CheckRequest, context: grpc.ServicerContext) -> pb.CheckReply:
-        context.abort(grpc.StatusCode.UNIMPLEMENTED, "Check: not there yet")
-        raise AssertionError("abort raises")
+        report = _check.check(self.environment, message.seed % 2**30, message.steps, self.deterministic)
+        return pb.CheckReply(
+            violations=[pb.Violation(rule=one.rule, sentence=one.sentence, warning=one.warning) for one in report.finish()],
+            checked=list(report.checked),
+            deterministic=report.deterministic,
+            episodes=report.episodes,
+            steps=report.steps,
+        )
 
 
 class Stream:

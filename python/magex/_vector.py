@@ -178,9 +178,9 @@ class VectorWorlds:
         self.layout = layout
         self.env: VectorEnvironment | None = None
         self.spoiled = False
+        # What the environment returned as observations last, for the check.
+        self.last: Any = None
         self.acts = np.zeros((0, len(layout.agents)), np.bool_)
-        # Plain arrays are copied in one go; other observations are written world by world.
-        self.shape = layout.shape
 
     def reset(self, seeds: Sequence[int], options: dict[str, Any] | None = None) -> Batch:
         if self.spoiled:
@@ -261,6 +261,7 @@ class VectorWorlds:
 
     def _observe(self, batch: Batch, where: Any, observations: Any, worlds: int, during: str) -> None:
         layout, count = self.layout, len(self.layout.agents)
+        self.last = observations
         if layout.shape is not None:
             array = self._array(observations, f"observations of {during}", (worlds, count, *layout.shape))
             batch.observations[where] = array.reshape(worlds, count, layout.width)
