@@ -1,5 +1,6 @@
 //! The actor's command line.
 
+use crate::environment::{EnvironmentSource, TIMEOUT_SECONDS};
 use crate::run::{self, ActorConfig, ActorError, ActorReport};
 use crate::worker::PolicyWorker;
 use clap::Args;
@@ -15,6 +16,7 @@ use magex_runtime::service::{self, ServiceArgs};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 /// Options of an actor. None of them can change a number of the run.
@@ -38,6 +40,13 @@ pub struct ActorArgs {
     /// Wait for another run when this one is complete
     #[arg(long, env = "MAGEX_ACTOR_STAY", value_parser = options::switch)]
     pub stay: bool,
+    /// Program that is the environment of a run with an external task: a command, which is started once for every rollout
+    /// thread, or the address of one that runs (http://, https://, unix:PATH)
+    #[arg(long, env = "MAGEX_ENVIRONMENT", value_name = "COMMAND")]
+    pub environment: Option<String>,
+    /// Seconds that this program has for its start and for each step
+    #[arg(long, env = "MAGEX_ENVIRONMENT_TIMEOUT", default_value_t = TIMEOUT_SECONDS, value_name = "SECONDS", value_parser = options::whole::<u64>(1, 86_400))]
+    pub environment_timeout: u64,
     /// Credentials for learner and commander.
     #[command(flatten)]
     #[serde(flatten)]
@@ -58,6 +67,11 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
         return Ok(exit::OK);
     }
     let config = configure(&args)?;
+    let environment = args
+        .environment
+        .as_deref()
+        .map(|text| EnvironmentSource::new(text, &config.client, Duration::from_secs(args.environment_timeout)));
+    let environment = environment.transpose()?;
     let report = service::main("actor", 1, &args.service, async |mut context| {
         let metrics = Arc::new(Metrics::new());
         context.serve_page(http::routes(metrics.clone()));
@@ -67,7 +81,7 @@ pub fn run(args: ActorArgs) -> Result<u8, Failure> {
             accepted.cancelled().await;
             context.announce();
         });
-        run::run(config, PolicyWorker::maker(), metrics, stop).await.map_err(|error| match &error {
+        run::run(config, PolicyWorker::maker(environment), metrics, stop).await.map_err(|error| match &error {
             ActorError::Url(_) | ActorError::NoThreads => Failure::usage(&error),
             // A restarted process may succeed.
             ActorError::Evicted(..) | ActorError::Stuck { .. } => Failure::new(exit::INTERNAL, &error),

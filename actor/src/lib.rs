@@ -8,12 +8,14 @@
 //! | [`pulse`] | whether a rollout thread still moves |
 //! | [`worker`] | the seam between the pool and the rollout, and the worker of production |
 //! | [`rollout`] | the rollout of one shard: a pure function of shard, seed, task, weights and goals |
+//! | [`environment`] | environments of other people: processes that are called over gRPC |
 //! | [`goal_client`] | the goals of a shard, from the commander service |
 //! | `weights_cache` | the stream of weights, and the two latest versions |
 //! | `metrics` | the actor's Prometheus metrics |
 //! | [`cli`] | the command line of `magex-actor` |
 
 pub mod cli;
+pub mod environment;
 pub mod goal_client;
 mod metrics;
 pub mod pulse;

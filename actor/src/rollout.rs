@@ -2,11 +2,14 @@
 //! the commander hands out. Nothing here knows a clock, a thread or an address.
 
 mod buffers;
+mod external;
 mod policy;
 
 use self::policy::{Carried, KeyedChooser};
+use crate::environment::{EnvironmentError, Environments};
 use crate::pulse::Pulse;
 use buffers::{Buffers, chain};
+use external::Ended;
 use magex_core::config::RunConfig;
 use magex_core::error::FieldError;
 use magex_core::ids::{Shard, ShardKind};
@@ -35,6 +38,9 @@ pub enum RolloutError<E> {
     /// No goals.
     #[error("goals: {0}")]
     Goals(E),
+    /// The environment of somebody else.
+    #[error(transparent)]
+    Environment(EnvironmentError),
     /// The policy's outputs are not finite.
     #[error("policy: logits[{place}] is not finite at step {step}: the weights of version {version} are broken")]
     NotFinite {
@@ -60,6 +66,8 @@ pub type MakeController = Box<dyn Fn(&TaskConfig, &[Key]) -> Result<Box<dyn Cont
 enum Source {
     Policy(Box<dyn Act>),
     Controller(MakeController),
+    /// Any action, in an external environment.
+    Random,
 }
 
 /// Everything that is the same for all shards of a version of the weights.
@@ -67,6 +75,8 @@ pub struct Roller {
     config: RunConfig,
     model: Model,
     source: Source,
+    /// For a task that is simulated by a program of its own.
+    pub environments: Option<Arc<Environments>>,
     /// Beats once per joint step.
     pub pulse: Pulse,
 }
@@ -83,13 +93,20 @@ impl Roller {
     pub fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
         let model = Model::new(config)?;
         let source = Source::Policy(model.load_policy(weights)?);
-        Ok(Self { config: config.clone(), model, source, pulse: Pulse::default() })
+        Ok(Self { config: config.clone(), model, source, environments: None, pulse: Pulse::default() })
     }
 
     /// With a controller instead of a policy (evaluation only).
     pub fn with_controller(config: &RunConfig, make: MakeController) -> Result<Self, ParamError> {
         let source = Source::Controller(make);
-        Ok(Self { config: config.clone(), model: Model::new(config)?, source, pulse: Pulse::default() })
+        let (config, model) = (config.clone(), Model::new(config)?);
+        Ok(Self { config, model, source, environments: None, pulse: Pulse::default() })
+    }
+
+    /// With random actions in an external environment.
+    pub fn at_random(config: &RunConfig) -> Result<Self, ParamError> {
+        let (config, model) = (config.clone(), Model::new(config)?);
+        Ok(Self { config, model, source: Source::Random, environments: None, pulse: Pulse::default() })
     }
 
     /// Share of random actions of action values; `None` for a policy, which is sampled. Evaluations know no iteration: they explore as
@@ -109,6 +126,11 @@ impl Roller {
         shard: &Shard,
         assign: impl FnOnce(&GoalRequest) -> Result<GoalReply, E>,
     ) -> Result<ShardResult, RolloutError<E>> {
+        if let Ok(external) = self.config.task.external() {
+            let missing = || EnvironmentError::Missing(external.environment.clone());
+            let environments = self.environments.as_ref().ok_or_else(|| RolloutError::Environment(missing()))?;
+            return self.rollout_in(shard, environments);
+        }
         let (task, seed) = (&self.config.task, self.config.run.seed);
         let keep = shard.kind == ShardKind::Train;
         let shape = task.shape(shard.episodes as usize);
@@ -128,6 +150,7 @@ impl Roller {
                 let graph = keys.iter().map(|k| k.graph);
                 Driver::Policy(policy.as_ref(), Carried::new(&self.model, shard, n, graph))
             }
+            Source::Random => return Err(FieldError::new("task.name", "is not external").into()),
             Source::Controller(make) => {
                 let keys: Vec<Key> = keys.iter().map(|k| k.controller).collect();
                 let mut controller = make(task, &keys)?;
@@ -186,6 +209,7 @@ impl Roller {
                 agent_state: recording.1,
                 statics: state.statics.episode(0).to_owned(),
                 goals: state.goals[..n * shape.goals_per_agent].to_vec(),
+                pictures: Vec::new(),
             });
             return Ok(ShardResult::Eval(EvalOutcome { shard: *shard, metrics, recording }));
         }
@@ -196,6 +220,27 @@ impl Roller {
         out.exact_costs = reply.exact_costs;
         out.metrics = metrics;
         Ok(ShardResult::Train(out))
+    }
+}
+
+impl Roller {
+    /// In one of the environments of this process; attempts that it spoils are repeated, others are not.
+    fn rollout_in<E>(&self, shard: &Shard, environments: &Environments) -> Result<ShardResult, RolloutError<E>> {
+        let mut own = None;
+        let result = environments.with(|environment| match self.rollout_external(shard, environment) {
+            Ok(result) => Ok(Some(result)),
+            Err(Ended::Environment(error)) => Err(error),
+            Err(Ended::Rollout(error)) => {
+                own = Some(error);
+                Ok(None)
+            }
+        });
+        match (result, own) {
+            (Ok(Some(result)), _) => Ok(result),
+            (_, Some(error)) => Err(error),
+            (Err(error), None) => Err(RolloutError::Environment(error)),
+            (Ok(None), None) => Err(FieldError::new("shard", "gave neither a result nor an error").into()),
+        }
     }
 }
 
@@ -234,6 +279,10 @@ fn columns(shape: &Shape, shard: &Shard, keep: bool) -> Trajectory {
         actions: Vec::with_capacity(rows * shape.action_components),
         log_probs: Vec::with_capacity(rows),
         rewards: Vec::with_capacity(rows),
+        moves: Vec::new(),
+        masks: Vec::new(),
+        marks: Vec::new(),
+        world_states: Vec::new(),
         goal_log_probs: Vec::new(),
         costs: Vec::new(),
         exact_costs: Vec::new(),

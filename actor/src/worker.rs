@@ -1,5 +1,6 @@
 //! The seam between the rollout pool and the rollout, and the worker of production.
 
+use crate::environment::{EnvironmentSource, Environments};
 use crate::goal_client::{GoalError, GrpcGoals};
 use crate::pulse::Pulse;
 use crate::rollout::{Roller, RolloutError};
@@ -63,6 +64,7 @@ pub struct PolicyWorker {
     /// With the SHA-256 of its weights.
     roller: Option<(String, Roller)>,
     pulse: Pulse,
+    environments: Option<Arc<Environments>>,
 }
 
 impl PolicyWorker {
@@ -81,12 +83,18 @@ impl PolicyWorker {
                 welcome.task_fingerprint
             )));
         }
-        Ok(Self { config, roller: None, pulse: Pulse::default() })
+        Ok(Self { config, roller: None, pulse: Pulse::default(), environments: None })
     }
 
-    /// A factory of such workers.
-    pub fn maker() -> MakeWorker {
-        Arc::new(|welcome| Ok(Box::new(Self::new(welcome)?)))
+    /// A factory of such workers. `source` says where the environments of a run with an external task come from.
+    pub fn maker(source: Option<EnvironmentSource>) -> MakeWorker {
+        Arc::new(move |welcome| {
+            let mut worker = Self::new(welcome)?;
+            // One for each thread: what a thread leaves behind is no concern of another.
+            let external = worker.config.task.external().ok().zip(source.clone());
+            worker.environments = external.map(|(external, source)| Arc::new(Environments::new(source, external)));
+            Ok(Box::new(worker))
+        })
     }
 
     fn roller(&mut self, weights: &Weights) -> Result<&Roller, WorkError> {
@@ -96,6 +104,7 @@ impl PolicyWorker {
                 let mut roller = Roller::new(&self.config, &weights.bytes)
                     .map_err(|error| WorkError::fatal(format!("weights version {}: {error}", weights.version)))?;
                 roller.pulse = self.pulse.clone();
+                roller.environments.clone_from(&self.environments);
                 roller
             }
         };
@@ -111,6 +120,7 @@ impl Worker for PolicyWorker {
     fn work(&mut self, shard: &Shard, weights: &Weights, goals: &mut GrpcGoals) -> Result<ShardResult, WorkError> {
         self.roller(weights)?.rollout(shard, |request| goals.assign(request)).map_err(|error| match error {
             RolloutError::Goals(error) => WorkError::Goals(error),
+            RolloutError::Environment(error) if !error.is_permanent() => WorkError::Retryable(error.to_string()),
             other => WorkError::fatal(other.to_string()),
         })
     }

@@ -167,7 +167,9 @@ async fn train(
     };
     let live = RunInfo { name: identity.name.clone(), learner: Some(address.to_string()), lease: Some(lease) };
     let limits = Limits::for_task(&config.task, max_shard_episodes(&config) as usize);
-    let limits = Limits { recompute: args.recompute, ..limits };
+    // What is not a function of its name has no second result to compare with.
+    let recompute = if config.task.pure() { args.recompute } else { 0.0 };
+    let limits = Limits { recompute, ..limits };
     let (handle, mut collector) = learner_service(identity, limits);
     collector.judge(judge(&config));
     trainer.observe(handle.observer());

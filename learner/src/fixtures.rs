@@ -52,6 +52,10 @@ pub(crate) fn trajectory(task: &TaskConfig, shard: Shard) -> Trajectory {
         actions: vec![1; t * b * n],
         log_probs: vec![-1.0; t * b * n],
         rewards: vec![0.3; t * b * n],
+        moves: Vec::new(),
+        masks: Vec::new(),
+        marks: Vec::new(),
+        world_states: Vec::new(),
         goal_log_probs: vec![-2.0; b],
         costs: vec![cost; b],
         exact_costs: vec![cost; b],
@@ -68,6 +72,7 @@ pub(crate) fn eval_outcome(task: &TaskConfig, mut shard: Shard, record: bool) ->
         positions: vec![0.5; (shape.steps + 1) * n * 2],
         agent_state: vec![],
         statics: Statics::landmarks(n, 2, vec![0.2; n * 2]),
+        pictures: Vec::new(),
         goals: (0..n as u32).collect(),
     });
     EvalOutcome { shard, metrics: metrics(shard.episodes as usize), recording }

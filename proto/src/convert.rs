@@ -89,6 +89,10 @@ impl From<&Shape> for v1::Shape {
             goals_per_agent: shape.goals_per_agent as u32,
             action_components: shape.action_components as u32,
             agent_state: shape.agent_state as u32,
+            world_state: shape.world_state as u32,
+            moves: shape.moves as u32,
+            masks: shape.masks as u32,
+            marks: shape.marks as u32,
         }
     }
 }
@@ -105,6 +109,10 @@ impl From<&v1::Shape> for Shape {
             goals_per_agent: shape.goals_per_agent as usize,
             action_components: shape.action_components as usize,
             agent_state: shape.agent_state as usize,
+            world_state: shape.world_state as usize,
+            moves: shape.moves as usize,
+            masks: shape.masks as usize,
+            marks: shape.marks as usize,
         }
     }
 }
@@ -145,6 +153,25 @@ fn statics(episodes: usize, message: Vec<v1::NamedArray>) -> Result<Statics, Con
 /// Most axes of a static array on the wire, that of the episodes included.
 const MAX_STATIC_AXES: usize = 4;
 
+/// An array that only some tasks have.
+fn floats_if(shape: &[usize], values: &[f32]) -> Option<v1::Array> {
+    (shape.last() != Some(&0)).then(|| arrays::from_f32(shape, values))
+}
+
+/// The same for bytes.
+fn bytes_if(shape: &[usize], values: &[u8]) -> Option<v1::Array> {
+    (shape.last() != Some(&0)).then(|| arrays::from_u8(shape, values))
+}
+
+/// The reverse: the numbers of an array of this width, none if it is 0.
+fn absent_or<T>(
+    array: Option<v1::Array>,
+    width: usize,
+    read: impl FnOnce(Option<v1::Array>) -> Result<Vec<T>, ConvertError>,
+) -> Result<Vec<T>, ConvertError> {
+    if width == 0 && array.is_none() { Ok(Vec::new()) } else { read(array) }
+}
+
 impl From<&Trajectory> for v1::Trajectory {
     fn from(trajectory: &Trajectory) -> Self {
         let s = &trajectory.shape;
@@ -155,6 +182,10 @@ impl From<&Trajectory> for v1::Trajectory {
             positions: Some(arrays::from_f32(&state, &trajectory.positions)),
             velocities: Some(arrays::from_f32(&state, &trajectory.velocities)),
             agent_state: Some(arrays::from_f32(&[t + 1, b, n, s.agent_state], &trajectory.agent_state)),
+            moves: floats_if(&[t, b, n, s.moves], &trajectory.moves),
+            masks: bytes_if(&[t, b, n, s.masks], &trajectory.masks),
+            marks: bytes_if(&[t + 1, b, n, s.marks], &trajectory.marks),
+            world_states: floats_if(&[t + 1, b, s.world_state], &trajectory.world_states),
             statics: named_arrays(b, &trajectory.statics),
             goals: Some(arrays::from_u32(&[b, n, s.goals_per_agent], &trajectory.goals)),
             actions: Some(arrays::from_u8(&[t, b, n, s.action_components], &trajectory.actions)),
@@ -179,6 +210,12 @@ fn trajectory(shard: Shard, message: v1::Trajectory) -> Result<Trajectory, Conve
         positions: arrays::to_f32("positions", message.positions, &state)?,
         velocities: arrays::to_f32("velocities", message.velocities, &state)?,
         agent_state: arrays::to_f32("agent_state", message.agent_state, &[t + 1, b, n, s.agent_state])?,
+        moves: absent_or(message.moves, s.moves, |array| arrays::to_f32("moves", array, &[t, b, n, s.moves]))?,
+        masks: absent_or(message.masks, s.masks, |array| arrays::to_u8("masks", array, &[t, b, n, s.masks]))?,
+        marks: absent_or(message.marks, s.marks, |array| arrays::to_u8("marks", array, &[t + 1, b, n, s.marks]))?,
+        world_states: absent_or(message.world_states, s.world_state, |array| {
+            arrays::to_f32("world_states", array, &[t + 1, b, s.world_state])
+        })?,
         statics: statics(b, message.statics)?,
         goals: arrays::to_u32("goals", message.goals, &[b, n, s.goals_per_agent])?,
         actions: arrays::to_u8("actions", message.actions, &[t, b, n, s.action_components])?,
@@ -200,6 +237,7 @@ impl From<&Recording> for v1::Recording {
             agent_state: Some(arrays::from_f32(&[s.steps + 1, s.agents, s.agent_state], &recording.agent_state)),
             statics: named_arrays(1, &recording.statics),
             goals: Some(arrays::from_u32(&[s.agents, s.goals_per_agent], &recording.goals)),
+            pictures: recording.pictures.clone(),
         }
     }
 }
@@ -215,6 +253,7 @@ impl TryFrom<v1::Recording> for Recording {
             agent_state: arrays::to_f32("agent_state", message.agent_state, &[s.steps + 1, s.agents, s.agent_state])?,
             statics: statics(1, message.statics)?,
             goals: arrays::to_u32("goals", message.goals, &[s.agents, s.goals_per_agent])?,
+            pictures: message.pictures,
         })
     }
 }

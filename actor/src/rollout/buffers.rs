@@ -41,6 +41,9 @@ impl Buffers {
             positions: &self.positions,
             velocities: &self.velocities,
             agent_state: &self.agent_state,
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: self.statics.view(),
             goals: &self.goals,
         }

@@ -18,6 +18,8 @@ pub(super) struct KeyedChooser<'a> {
     pub(super) epsilon: Option<f32>,
     /// [B·N, H]
     pub(super) actions: Vec<u8>,
+    /// [B·N, C]
+    pub(super) moves: Vec<f32>,
     /// `[B·N]`
     pub(super) log_probs: Vec<f32>,
     /// Place in the logits [B·N, A] of one that is not finite.
@@ -35,9 +37,20 @@ impl<'a> KeyedChooser<'a> {
             agents,
             epsilon: None,
             actions: vec![0; rows * heads.count()],
+            moves: vec![0.0; rows * heads.moves()],
             log_probs: vec![0.0; rows],
             not_finite: None,
         }
+    }
+}
+
+impl KeyedChooser<'_> {
+    /// Sets an agent's action to zeros.
+    pub(super) fn forget(&mut self, row: usize) {
+        let (components, moves) = (self.heads.count(), self.heads.moves());
+        self.actions[row * components..(row + 1) * components].fill(0);
+        self.moves[row * moves..(row + 1) * moves].fill(0.0);
+        self.log_probs[row] = 0.0;
     }
 }
 
@@ -46,7 +59,13 @@ impl Chooser for KeyedChooser<'_> {
         if let Some(place) = logits.iter().position(|x| !x.is_finite()) {
             self.not_finite.get_or_insert(row * logits.len() + place);
         }
-        let components = self.heads.count();
+        let (components, moves) = (self.heads.count(), self.heads.moves());
+        if moves > 0 {
+            let stream = self.streams.as_mut().map(|streams| &mut streams[row / self.agents]);
+            let drawn = &mut self.moves[row * moves..(row + 1) * moves];
+            self.log_probs[row] = self.heads.draw(logits, stream, drawn);
+            return &[];
+        }
         let action = &mut self.actions[row * components..(row + 1) * components];
         let stream = self.streams.as_mut().map(|streams| &mut streams[row / self.agents]);
         self.log_probs[row] = match self.epsilon {

@@ -122,6 +122,7 @@ impl About {
                 code: match task.action_code() {
                     ActionCode::Thrust => "thrust".to_owned(),
                     ActionCode::PerAxis => "per-axis".to_owned(),
+                    ActionCode::Own => "own".to_owned(),
                 },
                 choices,
             },

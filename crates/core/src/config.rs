@@ -10,7 +10,7 @@ mod setting;
 
 use crate::error::{FieldError, UnknownName, check_range};
 use crate::section::section;
-use crate::task::{RewardTarget, Spawn, TaskConfig};
+use crate::task::{RewardTarget, Spawn, TaskConfig, TaskName};
 use serde::de::IntoDeserializer as _;
 use serde::{Deserialize, Serialize};
 
@@ -302,7 +302,12 @@ impl RunConfig {
 
     /// Episodes per iteration unless they are chosen: about 200 agents' worth, a multiple of the shards.
     pub fn derived_episodes(&self) -> u32 {
-        let wanted = (200 / self.task.agents.max(1) as u32).clamp(4, 64);
+        let wanted = match self.task.name {
+            // About 4,096 agent samples.
+            TaskName::External => 4096 / (self.task.agents as u32 * self.task.horizon).max(1),
+            _ => 200 / self.task.agents.max(1) as u32,
+        };
+        let wanted = wanted.clamp(4, 64);
         wanted.next_multiple_of(self.collect.shards_per_iteration.max(1))
     }
 
@@ -326,7 +331,9 @@ impl RunConfig {
         }
         self.executor.check_ranges("executor")?;
         self.executor.check_kind()?;
-        let paid_for_goals = self.task.reward_target == RewardTarget::Goals;
+        self.check_external()?;
+        let simulated = self.task.name != TaskName::External;
+        let paid_for_goals = simulated && self.task.reward_target == RewardTarget::Goals;
         if self.executor.kind.flat() && self.executor.observes == Observes::Landmarks && paid_for_goals {
             let problem = "\"goals\" pays each agent for a goal that executor.observes = \"landmarks\" does not show it; use \
                            \"team\", or observe goals";
@@ -364,6 +371,33 @@ impl RunConfig {
         if self.executor.memory() > 0 && !horizon.is_multiple_of(chunk) {
             let problem = format!("{chunk} must divide task.horizon = {horizon}, or chunks would cross episodes");
             return Err(FieldError::new("mappo.chunk_length", problem));
+        }
+        Ok(())
+    }
+
+    /// Checks what an environment of somebody else cannot be combined with.
+    fn check_external(&self) -> Result<(), FieldError> {
+        if self.task.name != TaskName::External {
+            return Ok(());
+        }
+        let wrong = |key: &str, problem: &str| Err(FieldError::new(key, problem));
+        if self.run.algorithm != Algorithm::Mappo {
+            return wrong(
+                "run.algorithm",
+                "an external environment is trained by \"mappo\" (or IPPO: executor.centralised_critic)",
+            );
+        }
+        if self.executor.kind != ExecutorKind::Flat {
+            return wrong("executor.kind", "an external environment gives observation vectors: use \"flat\"");
+        }
+        if self.executor.observes != Observes::Landmarks || self.executor.nearest_first {
+            return wrong("executor", "observes and nearest_first belong to the simulated tasks; remove them");
+        }
+        if self.commander.kind.learned() || self.commander.power != 1.0 {
+            return wrong("commander", "an external environment has no goals to assign; remove this section");
+        }
+        if self.mappo.joint_ratio {
+            return wrong("mappo.joint_ratio", "agents of an external environment may leave it; use false");
         }
         Ok(())
     }

@@ -14,6 +14,12 @@ pub struct JointState<'a> {
     pub velocities: &'a [f32],
     /// [S, N, X] further state of the agents, by task.
     pub agent_state: &'a [f32],
+    /// [S, W] state of the world that only the critic sees; empty for most tasks.
+    pub world_states: &'a [f32],
+    /// [S, N, A] 1 for a choice that is allowed; empty if all are.
+    pub masks: &'a [u8],
+    /// [S, N] what is said of agents and states, see [`crate::trajectory::mark`]; empty for most tasks.
+    pub marks: &'a [u8],
     /// [Q, ...] the static arrays of the episodes, by name.
     pub statics: StaticsView<'a>,
     /// [Q, N, K]; see [`crate::task::TaskConfig::stages`].

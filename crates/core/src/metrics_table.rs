@@ -43,6 +43,12 @@ pub struct Metric {
 pub enum Scope {
     /// All.
     EveryTask,
+    /// Tasks with landmarks: all but external environments.
+    Landmarks,
+    /// Tasks that know a success: external environments may not.
+    Success,
+    /// External environments.
+    External,
     /// Tasks whose agents can crash.
     Crashes,
     /// Tasks with a second assignment stage.
@@ -92,7 +98,8 @@ pub const METRICS: &[Metric] = &[
     Metric {
         name: "success_rate",
         help: "covered at the last step: by an agent within 0.15, by a ball within 0.30 (Push Ball), by a drone within 0.15 \
-               that has not crashed",
+               that has not crashed; external environments: 1 for an episode that the environment calls a success",
+        scope: Scope::Success,
         sampled: Some("sampled_success_rate"),
         label: "success",
         progress: true,
@@ -103,6 +110,7 @@ pub const METRICS: &[Metric] = &[
     Metric {
         name: "matched_success_rate",
         help: "matched one-to-one to what covers them at the last step; Push Ball: covered by their own ball",
+        scope: Scope::Landmarks,
         label: "matched",
         replay: true,
         ..SHARE
@@ -111,6 +119,7 @@ pub const METRICS: &[Metric] = &[
         name: "all_covered_rate",
         unit: "share of episodes",
         help: "1 if every landmark is covered at the last step, otherwise 0",
+        scope: Scope::Landmarks,
         label: "all covered",
         ..SHARE
     },
@@ -119,6 +128,7 @@ pub const METRICS: &[Metric] = &[
         unit: "steps",
         help: "first step after which at least 99 % of the landmarks were covered; the horizon + 1 if that never happened",
         range: [1.0, f32::MAX],
+        scope: Scope::Landmarks,
         label: "arrival",
         format: Format::Decimals(1),
         progress: true,
@@ -131,6 +141,7 @@ pub const METRICS: &[Metric] = &[
         unit: "per agent and step",
         help: "other agents closer than two radii; drones: agents that crashed",
         range: [0.0, f32::MAX],
+        scope: Scope::Landmarks,
         sampled: Some("sampled_collisions_per_agent_step"),
         label: "collisions",
         format: Format::Decimals(4),
@@ -154,6 +165,7 @@ pub const METRICS: &[Metric] = &[
     Metric {
         name: "spawn_success_rate",
         help: "covered before the first step: the success of a team that does nothing",
+        scope: Scope::Landmarks,
         label: "at spawn",
         replay: true,
         ..SHARE
@@ -162,6 +174,7 @@ pub const METRICS: &[Metric] = &[
         name: "cost_ratio",
         help: "C_c / C_h, at the start of the episode: summed distance of the commander's assignment over that of the exact \
                one, from agents to their (first) goals",
+        scope: Scope::Landmarks,
         sampled: Some("sampled_cost_ratio"),
         label: "cost",
         ..COST
@@ -184,6 +197,32 @@ pub const METRICS: &[Metric] = &[
         progress: true,
         plot: Some(Scale::Free),
         replay: true,
+        ..SHARE
+    },
+    Metric {
+        name: "episode_return",
+        unit: "per agent",
+        help: "sum of the rewards of the first episode of a world, mean over the agents (external environments)",
+        range: [f32::MIN, f32::MAX],
+        scope: Scope::External,
+        sampled: Some("sampled_episode_return"),
+        label: "return",
+        format: Format::Decimals(2),
+        progress: true,
+        plot: Some(Scale::Free),
+        ..SHARE
+    },
+    Metric {
+        name: "episode_length",
+        unit: "steps",
+        help: "steps of the first episode of a world, at most the horizon (external environments)",
+        range: [0.0, f32::MAX],
+        scope: Scope::External,
+        sampled: Some("sampled_episode_length"),
+        label: "length",
+        format: Format::Decimals(1),
+        progress: true,
+        plot: Some(Scale::FromZero),
         ..SHARE
     },
 ];
@@ -222,6 +261,10 @@ pub const COST_RATIO: usize = row("cost_ratio");
 pub const SECOND_COST_RATIO: usize = row("second_cost_ratio");
 /// Row of the reward.
 pub const REWARD: usize = row("reward");
+/// Row of the return of an episode.
+pub const EPISODE_RETURN: usize = row("episode_return");
+/// Row of the length of an episode.
+pub const EPISODE_LENGTH: usize = row("episode_length");
 
 /// Row of a name; a name without a row does not compile.
 const fn row(name: &str) -> usize {
@@ -317,8 +360,10 @@ mod tests {
             let task = TaskConfig::of(name, 5, Spawn::Uniform);
             METRICS.iter().filter(|m| !m.applies(&task)).map(|m| m.name).collect::<Vec<_>>()
         };
-        assert_eq!(without(TaskName::SimpleSpread), ["collision_rate", "second_cost_ratio"]);
-        assert_eq!(without(TaskName::PushBall), ["collision_rate"]);
-        assert_eq!(without(TaskName::Drones), ["second_cost_ratio"]);
+        let own = ["episode_return", "episode_length"];
+        assert_eq!(without(TaskName::SimpleSpread), [&["collision_rate", "second_cost_ratio"], &own[..]].concat());
+        assert_eq!(without(TaskName::PushBall), [&["collision_rate"], &own[..]].concat());
+        assert_eq!(without(TaskName::Drones), [&["second_cost_ratio"], &own[..]].concat());
+        assert!(without(TaskName::External).iter().all(|name| !own.contains(name) && *name != "reward"));
     }
 }

@@ -30,7 +30,7 @@ macro_rules! section {
 
             /// The first key whose value is another one there.
             #[allow(dead_code, reason = "not every section belongs to one of several algorithms")]
-            pub(crate) fn changed(&self, other: &Self) -> Option<&'static str> {
+            pub fn changed(&self, other: &Self) -> Option<&'static str> {
                 $(if self.$key != other.$key {
                     return Some(stringify!($key));
                 })*

@@ -6,6 +6,7 @@
 mod bounds;
 mod definition;
 mod drones;
+mod external;
 mod observation;
 mod push_ball;
 mod simple_spread;
@@ -22,6 +23,7 @@ use toml::{Table, Value};
 pub use bounds::Bounds;
 pub use definition::Definition;
 pub use drones::{Downwash, DroneConfig};
+pub use external::{CHOICES_MAX, ExternalConfig};
 pub use observation::{Frame, Observation};
 pub use push_ball::PushBallConfig;
 pub use simple_spread::RewardConfig;
@@ -37,17 +39,23 @@ pub enum TaskName {
     PushBall,
     /// Quadrotors on a rigid-body engine (paper, section 5.1.2).
     Drones,
+    /// An environment of somebody else, behind `EnvironmentService`.
+    External,
 }
 
 impl TaskName {
     /// All tasks.
-    pub const ALL: [Self; 3] = [Self::SimpleSpread, Self::PushBall, Self::Drones];
+    pub const ALL: [Self; 4] = [Self::SimpleSpread, Self::PushBall, Self::Drones, Self::External];
+
+    /// The tasks that this program simulates itself.
+    pub const SIMULATED: [Self; 3] = [Self::SimpleSpread, Self::PushBall, Self::Drones];
 
     fn definition(self) -> &'static Definition {
         match self {
             Self::SimpleSpread => &simple_spread::DEFINITION,
             Self::PushBall => &push_ball::DEFINITION,
             Self::Drones => &drones::DEFINITION,
+            Self::External => &external::DEFINITION,
         }
     }
 }
@@ -85,6 +93,8 @@ pub enum ActionCode {
     Thrust,
     /// One component per axis: 0 forward (+), 1 stop, 2 backward (−).
     PerAxis,
+    /// The environment's own.
+    Own,
 }
 
 /// What the reward pays for.
@@ -110,6 +120,8 @@ pub enum TaskSettings {
     PushBall(PushBallConfig),
     /// `[task.drones]`
     Drones(DroneConfig),
+    /// `[task.external]`
+    External(ExternalConfig),
 }
 
 /// A task, fully determined. Equal tasks have equal fingerprints.
@@ -177,12 +189,21 @@ pub const TASK_SEMANTICS: u32 = 2;
 pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
     let raw: RawTask = toml_table::read("task", keys, bounds)?;
     let missing = |key: &str| {
-        let remedy = "missing; a [task] section needs name (simple-spread, push-ball or drones), agents and spawn";
+        let remedy = "missing; a [task] section needs name (simple-spread, push-ball or drones; or external, with \
+                      --environment), agents and spawn";
         FieldError::new(format!("task.{key}"), remedy)
     };
     let name = raw.name.ok_or_else(|| missing("name"))?;
+    let external = name == TaskName::External;
+    if external && raw.spawn.is_some() {
+        return Err(FieldError::new("task.spawn", "the environment starts its episodes itself; remove it"));
+    }
+    if external && !raw.sections.contains_key(name.definition().section) {
+        let problem = "missing: start with --environment COMMAND, which describes itself";
+        return Err(FieldError::new("task.external", problem));
+    }
     let agents = raw.agents.ok_or_else(|| missing("agents"))?;
-    let spawn = raw.spawn.ok_or_else(|| missing("spawn"))?;
+    let spawn = if external { Spawn::Uniform } else { raw.spawn.ok_or_else(|| missing("spawn"))? };
     for (key, zero) in [
         ("side", raw.side == Some(0.0)),
         ("horizon", raw.horizon == Some(0)),
@@ -197,6 +218,9 @@ pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
     let mut own = Table::new();
     for (key, value) in raw.sections {
         own = own_section(name, &key, value)?;
+    }
+    if external && raw.horizon.is_none() {
+        return Err(FieldError::new("task.horizon", external::NO_HORIZON));
     }
     Ok(TaskConfig {
         name,
@@ -274,7 +298,7 @@ impl TaskConfig {
 
     /// X: further numbers of an agent's state that an agent sees and the wire carries.
     pub fn agent_state(&self) -> usize {
-        self.definition().agent_state
+        self.external().map_or(self.definition().agent_state, |external| external.observation_width)
     }
 
     /// Choices of each action component.
@@ -282,6 +306,7 @@ impl TaskConfig {
         match self.action_code() {
             ActionCode::Thrust => vec![5],
             ActionCode::PerAxis => vec![3; self.dims()],
+            ActionCode::Own => self.external().map_or_else(|_| Vec::new(), |external| external.choices.clone()),
         }
     }
 
@@ -313,16 +338,22 @@ impl TaskConfig {
 
     /// Sizes of the arrays of a shard of B = `episodes` episodes.
     pub fn shape(&self, episodes: usize) -> Shape {
+        let external = self.external().ok();
+        let placed = if external.is_some() { 0 } else { self.agents };
         Shape {
             steps: self.horizon as usize,
             episodes,
             agents: self.agents,
-            bodies: self.agents + self.balls(),
-            landmarks: self.agents,
+            bodies: placed + self.balls(),
+            landmarks: placed,
             dims: self.dims(),
             agent_state: self.agent_state(),
             goals_per_agent: self.stages().len(),
             action_components: self.action_heads().len(),
+            world_state: external.map_or(0, |external| external.state_width),
+            moves: external.map_or(0, ExternalConfig::moves),
+            masks: external.filter(|external| external.masks).map_or(0, |external| external.choices.iter().sum()),
+            marks: usize::from(external.is_some()),
         }
     }
 
@@ -351,6 +382,9 @@ impl Metric {
     pub fn applies(&self, task: &TaskConfig) -> bool {
         match self.scope {
             Scope::EveryTask => true,
+            Scope::Landmarks => task.name != TaskName::External,
+            Scope::Success => task.external().map_or(true, |external| external.successes),
+            Scope::External => task.name == TaskName::External,
             Scope::Crashes => task.definition().crashes,
             Scope::SecondStage => task.stages().len() > 1,
         }

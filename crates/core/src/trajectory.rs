@@ -26,8 +26,28 @@ pub struct Shape {
     pub agent_state: usize,
     /// K: goals per agent (Simple Spread: 1, its landmark; Push Ball: 2, its ball and the ball's landmark).
     pub goals_per_agent: usize,
-    /// H: components of an action.
+    /// H: components of an action that are choices.
     pub action_components: usize,
+    /// S: numbers of the state of a world that only the critic sees (external environments).
+    pub world_state: usize,
+    /// C: components of an action that are real numbers (external environments).
+    pub moves: usize,
+    /// A: choices of all components, where some may be forbidden (external environments); otherwise 0.
+    pub masks: usize,
+    /// 1 if the episodes of a row of worlds can end before the last step (external environments); otherwise 0.
+    pub marks: usize,
+}
+
+/// What a mark says about an agent and a state: a set of bits.
+pub mod mark {
+    /// The agent acts in this state.
+    pub const ACTIVE: u8 = 1;
+    /// The state begins an episode of its world.
+    pub const FIRST: u8 = 2;
+    /// The agent's episode ended with this state, because of what happened.
+    pub const TERMINATED: u8 = 4;
+    /// The agent's episode was cut at this state.
+    pub const TRUNCATED: u8 = 8;
 }
 
 /// B whole episodes of T joint steps as the actor saw them: states, not observations. All arrays are row-major.
@@ -54,6 +74,15 @@ pub struct Trajectory {
     pub log_probs: Vec<f32>,
     /// [T, B, N] reward of the state after action t.
     pub rewards: Vec<f32>,
+    /// [T, B, N, C] real numbers of the actions as the policy drew them, before they are taken to the environment's range.
+    pub moves: Vec<f32>,
+    /// [T, B, N, A] 1 for a choice that was allowed; empty if all always are.
+    pub masks: Vec<u8>,
+    /// [T+1, B, N] see [`mark`]; empty if every agent acts in every step and episodes end at the horizon only. A world whose
+    /// episode has ended begins another one in the next step, in which nobody acts: the state before it is the true last one.
+    pub marks: Vec<u8>,
+    /// [T+1, B, S] state of the worlds.
+    pub world_states: Vec<f32>,
     /// [B, K] log-probability of the commander's assignment of each stage.
     pub goal_log_probs: Vec<f32>,
     /// [B, K] C_c: summed distance of the commander's assignment.
@@ -115,6 +144,9 @@ pub struct Recording {
     pub statics: Statics,
     /// [N, K]
     pub goals: Vec<u32>,
+    /// PNG files in base64, in the order of time, of an environment that draws itself.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub pictures: Vec<String>,
 }
 
 /// Result of an evaluation shard.
@@ -158,10 +190,12 @@ impl Trajectory {
         let s = &self.shape;
         let (t, b, n) = (s.steps, s.episodes, s.agents);
         let state = (t + 1) * b * s.bodies * s.dims;
-        let floats: [(&str, &[f32], usize); 8] = [
+        let floats: [(&str, &[f32], usize); 10] = [
             ("positions", &self.positions, state),
             ("velocities", &self.velocities, state),
             ("agent_state", &self.agent_state, (t + 1) * b * n * s.agent_state),
+            ("moves", &self.moves, t * b * n * s.moves),
+            ("world_states", &self.world_states, (t + 1) * b * s.world_state),
             ("log_probs", &self.log_probs, t * b * n),
             ("rewards", &self.rewards, t * b * n),
             ("goal_log_probs", &self.goal_log_probs, b * s.goals_per_agent),
@@ -173,7 +207,9 @@ impl Trajectory {
             check_finite(name, data)?;
         }
         self.statics.check_numbers(b)?;
-        if let Some(place) = self.log_probs.iter().position(|&x| x > 1e-4) {
+        // A density may be above 1.
+        let above = |x: &f32| s.moves == 0 && *x > 1e-4;
+        if let Some(place) = self.log_probs.iter().position(above) {
             let problem = format!("{} is above 0", self.log_probs[place]);
             return Err(FieldError::new(format!("log_probs[{place}]"), problem));
         }
@@ -184,6 +220,27 @@ impl Trajectory {
             return Err(FieldError::new(format!("goals[{place}]"), problem));
         }
         check_count("actions", "entries", self.actions.len(), t * b * n * s.action_components)?;
+        self.check_marks()?;
         check_count("metrics", "entries", self.metrics.len(), b)
+    }
+
+    /// Masks and marks: sizes, values, and that they agree with each other.
+    fn check_marks(&self) -> Result<(), FieldError> {
+        let s = &self.shape;
+        let states = s.episodes * s.agents;
+        check_count("masks", "entries", self.masks.len(), s.steps * states * s.masks)?;
+        check_count("marks", "entries", self.marks.len(), (s.steps + 1) * states * s.marks)?;
+        if let Some(place) = self.masks.iter().position(|&mask| mask > 1) {
+            return Err(FieldError::new(format!("masks[{place}]"), format!("{} is not 0 or 1", self.masks[place])));
+        }
+        for (place, &mark) in self.marks.iter().enumerate() {
+            let ended = mark & (mark::TERMINATED | mark::TRUNCATED) != 0;
+            let begins = place < states;
+            let fits = mark < 16 && !(ended && mark & (mark::ACTIVE | mark::FIRST) != 0);
+            if !fits || (begins && mark & mark::FIRST == 0) {
+                return Err(FieldError::new(format!("marks[{place}]"), format!("{mark} cannot be")));
+            }
+        }
+        Ok(())
     }
 }

@@ -64,6 +64,10 @@ impl Classical {
 
     /// Whether it can drive a task.
     pub fn check(self, task: &TaskConfig) -> Result<(), FieldError> {
+        if task.name == TaskName::External && self != Self::Random {
+            let problem = format!("{self} knows the simulated tasks only; for an external environment use random");
+            return Err(FieldError::new("controller", problem));
+        }
         if matches!(self, Self::Astar | Self::Orca) && task.name == TaskName::PushBall {
             let problem = format!(
                 "{self} brings agents to landmarks, but in push-ball they have to push balls there; \

@@ -151,6 +151,7 @@ impl<R: Rules + ?Sized> Env<R> {
         let (most, choices) = match self.action_code {
             ActionCode::Thrust => (4, "0 none, 1 +x, 2 -x, 3 +y, 4 -y"),
             ActionCode::PerAxis => (2, "0 forward, 1 stop, 2 backward"),
+            ActionCode::Own => (u8::MAX, "the environment's own choices"),
         };
         // The maximum first: it vectorises, the search does not.
         if actions.iter().fold(0, |largest, &action| largest.max(action)) <= most {

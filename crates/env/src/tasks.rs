@@ -29,6 +29,7 @@ pub(crate) fn starts(
             TaskName::SimpleSpread => spread::start(task, &mut stream, &mut starts),
             TaskName::PushBall => push_ball::start(task, training, &mut stream, &mut starts)?,
             TaskName::Drones => drones::start(task, &mut stream, &mut starts)?,
+            TaskName::External => return Err(elsewhere()),
         }
     }
     starts.velocities = vec![0.0; starts.positions.len()];
@@ -51,14 +52,20 @@ fn assemble(task: &TaskConfig, starts: Starts) -> Result<Env, FieldError> {
         TaskName::SimpleSpread => spread::rules(task, &starts)?,
         TaskName::PushBall => push_ball::rules(task, &starts)?,
         TaskName::Drones => Box::new(drones::Flight::new(task, &starts)?),
+        TaskName::External => return Err(elsewhere()),
     };
     Ok(Env::new(task, starts, rules))
+}
+
+/// The refusal of a task that is not simulated here.
+fn elsewhere() -> FieldError {
+    FieldError::new("task.name", "external is simulated by a program of its own; give --environment")
 }
 
 /// The scripted controller of a task: a yardstick.
 pub fn scripted(task: &TaskConfig) -> Box<dyn Controller> {
     match task.name {
-        TaskName::SimpleSpread => Box::new(SpreadScript::new(task.agents)),
+        TaskName::SimpleSpread | TaskName::External => Box::new(SpreadScript::new(task.agents)),
         TaskName::PushBall => Box::new(PushBallScript::new(task.agents)),
         TaskName::Drones => Box::new(DroneScript::new(task.agents)),
     }

@@ -29,6 +29,9 @@ fn play(kind: Classical, task: &TaskConfig, episodes: &[u32]) -> (Vec<Vec<u8>>, 
             positions: &positions,
             velocities: &velocities,
             agent_state: &agent_state,
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: env.statics().view(),
             goals: &goals,
         };
@@ -98,7 +101,16 @@ fn what_does_not_fit_is_refused_by_name() {
     let env = new_env(&task, [Key::new(1, Purpose::EvalSpawn, &[]).stream()].into_iter(), false).unwrap();
     let (positions, velocities) = (env.positions(), env.velocities());
     let (statics, goals) = (env.statics().view(), &[0, 1][..]);
-    let state = JointState { positions: &positions, velocities: &velocities, agent_state: &[], statics, goals };
+    let state = JointState {
+        positions: &positions,
+        velocities: &velocities,
+        agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
+        statics,
+        goals,
+    };
     for kind in Classical::ALL.into_iter().filter(|kind| *kind != Classical::Scripted) {
         let error = classical(kind, &task, &[]).unwrap().act(&state, &mut [0; 2]).unwrap_err().to_string();
         assert!(error.contains("began 0 episodes"), "{kind}: {error}");

@@ -41,6 +41,9 @@ fn play(task: &TaskConfig, episodes: u32) -> Vec<EpisodeMetrics> {
             positions: &positions,
             velocities: &velocities,
             agent_state: &[],
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: statics.view(),
             goals: &goals,
         };
@@ -96,6 +99,9 @@ fn the_choice_depends_on_the_state_alone() {
                 positions: &p[20 * b..20 * b + 20],
                 velocities: &v[20 * b..20 * b + 20],
                 agent_state: &[],
+                world_states: &[],
+                masks: &[],
+                marks: &[],
                 statics: statics.episode(b),
                 goals: &goals[10 * b..10 * b + 10],
             };
@@ -111,6 +117,9 @@ fn the_choice_depends_on_the_state_alone() {
         positions: &positions,
         velocities: &velocities,
         agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
         statics: statics.view(),
         goals: &goals,
     };

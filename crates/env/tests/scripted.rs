@@ -40,6 +40,9 @@ fn play(agents: usize, spawn: Spawn, episodes: u32) -> Vec<EpisodeMetrics> {
             positions: &positions,
             velocities: &velocities,
             agent_state: &[],
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: statics.view(),
             goals: &goals,
         };

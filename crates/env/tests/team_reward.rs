@@ -83,6 +83,7 @@ fn expected(task: &TaskConfig, before: &[f32], after: &[f32], landmarks: &[f32])
                 + f64::from(p.bonus) * share(&mut distances(2, balls, landmarks), 0.3)
                 - f64::from(p.distance) * (mean(distances(2, agents, balls)) + mean(distances(2, balls, landmarks)))
         }
+        TaskName::External => unreachable!("simulated elsewhere"),
         TaskName::Drones => {
             let c = task.drones().unwrap();
             let gained = mean(distances(3, before, landmarks)) - mean(distances(3, after, landmarks));

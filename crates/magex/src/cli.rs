@@ -1,7 +1,8 @@
 //! The command line: commands and exit codes.
 
 use crate::commands::{
-    act, assign, bench, compare, eval, export, health, replay, reproduce, roles, trace, train, train_commander, verify,
+    act, assign, bench, check_environment, compare, eval, export, health, replay, reproduce, roles, trace, train,
+    train_commander, verify,
 };
 use crate::failure;
 use crate::options::CommonOptions;
@@ -51,6 +52,7 @@ enum Command {
     Act(act::ActArgs),
     Export(export::ExportArgs),
     Assign(assign::AssignArgs),
+    CheckEnvironment(check_environment::CheckEnvironmentArgs),
     Bench(bench::BenchArgs),
     Verify(verify::VerifyArgs),
     Health(health::HealthArgs),
@@ -93,6 +95,7 @@ pub fn main() -> ExitCode {
         Command::Act(args) => act::run(args, &options),
         Command::Export(args) => export::run(args, &options),
         Command::Assign(args) => assign::run(args, &options),
+        Command::CheckEnvironment(args) => check_environment::run(args, &options),
         Command::Bench(args) => Ok(bench::run(args, &options)),
         Command::Verify(args) => verify::run(args, &options),
         Command::Health(args) => health::run(args, &options),

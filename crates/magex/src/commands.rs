@@ -3,6 +3,7 @@
 pub(crate) mod act;
 pub(crate) mod assign;
 pub(crate) mod bench;
+pub(crate) mod check_environment;
 pub(crate) mod compare;
 pub(crate) mod eval;
 pub(crate) mod export;

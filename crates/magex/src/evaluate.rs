@@ -1,5 +1,6 @@
 //! Evaluation in this process: shards of whole episodes on spawns that training never saw.
 
+use crate::external::EnvironmentArgs;
 use crate::failure::usage;
 use crate::folder::{self, Trained};
 use crate::local::{LoadedPolicy, commander};
@@ -10,7 +11,7 @@ use magex_actor::rollout::Roller;
 use magex_assign::POWERS;
 use magex_core::config::{Algorithm, CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
-use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn};
+use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn, TaskName};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_env::Classical;
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
@@ -115,6 +116,8 @@ pub(crate) struct Subject {
     #[arg(long)]
     strict: bool,
     #[command(flatten)]
+    environment: EnvironmentArgs,
+    #[command(flatten)]
     pub(crate) vary: Variation,
 }
 
@@ -136,6 +139,18 @@ impl Subject {
         Ok((trained, config))
     }
 
+    /// What rolls the episodes out, and what a controller without weights took for it.
+    pub(crate) fn policy(
+        &self,
+        config: &RunConfig,
+        weights: &[u8],
+    ) -> anyhow::Result<(LoadedPolicy, Option<PlanningClock>)> {
+        let environments = self.environment.of_run(config)?;
+        let (mut policy, planning) = self.vary.policy(config, weights)?;
+        policy.roller.environments = environments;
+        Ok((policy, planning))
+    }
+
     /// A configuration file in place of a run, for what has no weights.
     fn untrained(&self) -> anyhow::Result<Trained> {
         let file = self.run.display();
@@ -145,7 +160,8 @@ impl Subject {
                  name a run folder, or add --controller scripted, astar, orca, nearest or random"
             )));
         }
-        let trained = folder::untrained(&self.run)?;
+        let described = self.environment.describe()?;
+        let trained = folder::untrained(&self.run, described.as_ref())?;
         let scheduler = self.vary.scheduler_of(&trained.config);
         if scheduler.learned() {
             return Err(usage(format!(
@@ -238,6 +254,7 @@ impl Variation {
     ) -> anyhow::Result<(LoadedPolicy, Option<PlanningClock>)> {
         let (roller, planning) = match self.controller.classical() {
             None => (Roller::new(config, weights)?, None),
+            Some(Classical::Random) if config.task.name == TaskName::External => (Roller::at_random(config)?, None),
             Some(classical) => {
                 let clock = PlanningClock::default();
                 (Roller::with_controller(config, clock.timed(classical))?, Some(clock))

@@ -12,7 +12,9 @@
 //! | `logs/` | standard error of the services |
 //! | `.lock` | locked by the process that writes to the folder |
 
+use crate::external::Described;
 use crate::failure::{cannot_create, usage};
+use crate::settings::Overrides;
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
 use magex_core::sha256;
@@ -161,8 +163,12 @@ pub fn load(path: &Path, config: Option<&Path>) -> anyhow::Result<Trained> {
 }
 
 /// A configuration file as a run without weights.
-pub(crate) fn untrained(path: &Path) -> anyhow::Result<Trained> {
-    let (config, name) = (crate::settings::read_from("RUN", path)?, path.display().to_string());
+pub(crate) fn untrained(path: &Path, described: Option<&Described>) -> anyhow::Result<Trained> {
+    let config = match described {
+        Some(_) => Overrides::default().read(Some(path), described)?,
+        None => crate::settings::read_from("RUN", path)?,
+    };
+    let name = path.display().to_string();
     Ok(Trained {
         config,
         weights: Vec::new(),

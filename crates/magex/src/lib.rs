@@ -11,6 +11,7 @@
 //! | [`folder`], `artifacts` | run folders, and the pictures in them |
 
 pub mod cli;
+mod external;
 pub mod failure;
 pub mod folder;
 pub mod local;

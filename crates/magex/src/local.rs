@@ -2,6 +2,7 @@
 
 use crate::parallel;
 use crate::progress::LiveLine;
+use magex_actor::environment::Environments;
 use magex_actor::rollout::Roller;
 use magex_commander::shard_goals::answer;
 use magex_core::config::{CommanderPolicy, RunConfig};
@@ -25,9 +26,11 @@ pub(crate) struct LoadedPolicy {
 }
 
 impl LoadedPolicy {
-    fn new(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
+    fn new(config: &RunConfig, weights: &[u8], environments: Option<Arc<Environments>>) -> Result<Self, ParamError> {
+        let mut roller = Roller::new(config, weights)?;
+        roller.environments = environments;
         Ok(Self {
-            roller: Roller::new(config, weights)?,
+            roller,
             commander: commander(config, weights, None)?,
             random_assignment_fraction: config.commander.random_assignment_fraction,
         })
@@ -73,7 +76,7 @@ pub(crate) fn judge(config: &RunConfig) -> Compute {
     Box::new(move |shard, weights| {
         let policy = match loaded.take() {
             Some((sha256, policy)) if sha256 == weights.sha256 => policy,
-            _ => LoadedPolicy::new(&config, &weights.bytes).map_err(|error| error.to_string())?,
+            _ => LoadedPolicy::new(&config, &weights.bytes, None).map_err(|error| error.to_string())?,
         };
         let (_, policy) = loaded.insert((weights.sha256.clone(), policy));
         let results = policy.rollout_all(std::slice::from_ref(shard), 1, |_| {}).map_err(|error| error.to_string())?;
@@ -89,12 +92,18 @@ pub struct LocalCollector {
     policy: Option<LoadedPolicy>,
     stop: Arc<AtomicBool>,
     live: Option<LiveLine>,
+    environments: Option<Arc<Environments>>,
 }
 
 impl LocalCollector {
     /// Setting `stop` ends the run after the current iteration.
     pub fn new(config: &RunConfig, threads: usize, stop: Arc<AtomicBool>) -> Self {
-        Self { config: config.clone(), threads, policy: None, stop, live: None }
+        Self { config: config.clone(), threads, policy: None, stop, live: None, environments: None }
+    }
+
+    /// Rolls out in these environments, if the task is external.
+    pub(crate) fn in_environments(self, environments: Option<Arc<Environments>>) -> Self {
+        Self { environments, ..self }
     }
 
     /// Shows the shards that are done in a status line.
@@ -105,7 +114,7 @@ impl LocalCollector {
 
 impl Collector for LocalCollector {
     fn publish(&mut self, weights: &Arc<Weights>) -> Result<(), CollectError> {
-        self.policy = Some(LoadedPolicy::new(&self.config, &weights.bytes)?);
+        self.policy = Some(LoadedPolicy::new(&self.config, &weights.bytes, self.environments.clone())?);
         Ok(())
     }
 

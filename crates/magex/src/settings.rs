@@ -1,6 +1,7 @@
 //! The effective configuration of a run: defaults, then the file, then the settings of single keys, then the options of the
 //! command.
 
+use crate::external::Described;
 use anyhow::Context as _;
 use magex_core::config::{COLLISIONS_ANY, ConfigError, ExecutorKind, RunConfig, SEED_MAX, STEPS_MAX, Setting};
 use magex_core::task::{AGENTS_MAX, Spawn};
@@ -52,8 +53,9 @@ pub(crate) struct Overrides {
 
 impl Overrides {
     /// The configuration of a file, or the default one, with the settings of single keys.
-    pub(crate) fn read(&self, path: Option<&Path>) -> anyhow::Result<RunConfig> {
+    pub(crate) fn read(&self, path: Option<&Path>, described: Option<&Described>) -> anyhow::Result<RunConfig> {
         let text = path.map_or_else(|| Ok(String::new()), |path| options::text_file("", path))?;
+        let text = described.map_or_else(|| Ok(text.clone()), |described| described.fill(&text))?;
         let file = || path.map_or_else(String::new, |path| path.display().to_string());
         RunConfig::from_toml_with(&text, &self.settings).map_err(|error| {
             // The file is at fault itself if it is refused without them in the same words.

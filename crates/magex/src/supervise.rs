@@ -56,6 +56,10 @@ pub(crate) struct ServicesPlan<'a> {
     /// Address of the live page, if there is one.
     pub(crate) http: Option<&'a str>,
     pub(crate) actors: ActorPlan,
+    /// An actor's options for its environment.
+    pub(crate) environment: &'a [String],
+    /// Whether there are goals to assign.
+    pub(crate) commander: bool,
 }
 
 /// Trains on services of this machine until the run is complete or interrupted.
@@ -105,8 +109,11 @@ pub(crate) async fn run(
     // The commander is ready with the first weights: a learner that ends before (a complete run has no work) never sends any.
     let unbound = commander("127.0.0.1:0");
     let first = loop {
+        if !plan.commander {
+            break None;
+        }
         let status = tokio::select! {
-            started = unbound.start() => break started?,
+            started = unbound.start() => break Some(started?),
             status = running.wait() => status?,
             () = interrupted.cancelled() => {
                 running.stop().await;
@@ -118,16 +125,19 @@ pub(crate) async fn run(
         }
         running = learner.restart(&mut lives, pauses()).await?;
     };
-    let commander_url = format!("http://{}", first.address);
+    let commander_url = first.as_ref().map(|first| format!("http://{}", first.address));
     tracing::debug!(learner = url, commander = commander_url, "services");
 
     let stop = CancellationToken::new();
     let mut services = JoinSet::new();
-    services.spawn(keep(commander(&first.address), first, stop.clone()));
+    if let Some(first) = first {
+        services.spawn(keep(commander(&first.address), first, stop.clone()));
+    }
     for index in 0..plan.actors.actors {
         let (name, threads) = (format!("actor-{index}"), plan.actors.threads.to_string());
-        let arguments =
-            ["actor", "--name", &name, "--learner", &url, "--commander", &commander_url, "--threads", &threads];
+        let mut arguments = vec!["actor", "--name", &name, "--learner", &url, "--threads", &threads];
+        arguments.extend(commander_url.iter().flat_map(|url| ["--commander", url]));
+        arguments.extend(plan.environment.iter().map(String::as_str));
         let actor = Service::new(&name, &arguments, logs).unawaited();
         let first = actor.start().await?;
         services.spawn(keep(actor, first, stop.clone()));

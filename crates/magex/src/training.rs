@@ -7,6 +7,7 @@ use crate::local::LocalCollector;
 use crate::output::note;
 use crate::progress::Progress;
 use crate::supervise::{self, ActorPlan, ServicesPlan, TrainEnd};
+use magex_actor::environment::Environments;
 use magex_core::config::RunConfig;
 use magex_core::ids::RunId;
 use magex_learner::run_folder::{Claim, RunFolderState};
@@ -36,6 +37,8 @@ pub(crate) struct Means {
     pub(crate) actors: Option<ActorPlan>,
     /// The name of this process in the lock of a run folder.
     pub(crate) command: &'static str,
+    /// The environments of an external task: those of this process, and the options of an actor.
+    pub(crate) environment: (Option<Arc<Environments>>, Vec<String>),
 }
 
 /// A run that is ready to start.
@@ -117,7 +120,9 @@ impl Plan {
                 drop(trainer);
                 let (folder, http) = (self.folder.as_path(), self.means.http.as_deref());
                 let lock = &self.claim.lock;
-                let services = ServicesPlan { folder, lock, threads: self.means.threads, http, actors };
+                let (threads, environment) = (self.means.threads, self.means.environment.1.as_slice());
+                let commander = !self.config.task.stages().is_empty();
+                let services = ServicesPlan { folder, lock, threads, http, actors, environment, commander };
                 runtime.block_on(supervise::run(&services, interrupted, progress))
             }
         }
@@ -179,7 +184,9 @@ impl Plan {
 
         let (events, received) = mpsc::channel();
         trainer.observe(events);
-        let mut collector = LocalCollector::new(&self.config, self.means.threads, stop).showing(progress.live());
+        let environments = self.means.environment.0.clone();
+        let collector = LocalCollector::new(&self.config, self.means.threads, stop);
+        let mut collector = collector.showing(progress.live()).in_environments(environments);
         let outcome = std::thread::scope(|scope| {
             let thread = std::thread::Builder::new().name("magex-train".into()).stack_size(64 << 20);
             let training = thread.spawn_scoped(scope, move || trainer.run(&mut collector));

@@ -3,18 +3,33 @@
 
 use crate::ops::{LANES, exp_of_negative};
 use magex_core::rng::Stream;
+use magex_core::task::CHOICES_MAX;
 use wide::f32x16;
 
-/// Components of an action; each is an independent categorical over its own logits, which stand side by side in a row.
+/// Components of an action. Each is an independent categorical over its own logits, which stand side by side in a row; or, where
+/// there are no such components, a real number with a normal distribution: C means, then C logarithms of standard deviations.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActionHeads {
     sizes: Vec<usize>,
+    /// C.
+    moves: usize,
 }
 
 impl ActionHeads {
-    /// From the number of choices of each component (each between 1 and 16).
+    /// From the number of choices of each component (each between 1 and 256).
     pub fn new(sizes: Vec<usize>) -> Option<Self> {
-        (!sizes.is_empty() && sizes.iter().all(|s| (1..=LANES).contains(s))).then_some(Self { sizes })
+        let fits = !sizes.is_empty() && sizes.iter().all(|s| (1..=CHOICES_MAX).contains(s));
+        fits.then_some(Self { sizes, moves: 0 })
+    }
+
+    /// C real numbers.
+    pub fn gaussian(moves: usize) -> Self {
+        Self { sizes: Vec::new(), moves }
+    }
+
+    /// C: real numbers of an action.
+    pub fn moves(&self) -> usize {
+        self.moves
     }
 
     /// H: components.
@@ -24,7 +39,7 @@ impl ActionHeads {
 
     /// A: logits of a row.
     pub fn logits(&self) -> usize {
-        self.sizes.iter().sum()
+        self.sizes.iter().sum::<usize>() + 2 * self.moves
     }
 
     /// Choices of each component.
@@ -54,10 +69,15 @@ impl ActionHeads {
     /// Chooses an action for one row; returns its log-probability. `stream` = None takes the most likely choices (the
     /// first of equals).
     pub fn choose(&self, logits: &[f32], mut stream: Option<&mut Stream>, action: &mut [u8]) -> f32 {
-        let mut log_probs = [0.0f32; LANES];
+        let (mut few, mut many) = ([0.0f32; LANES], Vec::new());
         let (mut at, mut total) = (0, 0.0);
         for (&size, slot) in self.sizes.iter().zip(action) {
-            let log_probs = &mut log_probs[..size];
+            let log_probs = if size <= LANES {
+                &mut few[..size]
+            } else {
+                many.resize(size, 0.0);
+                &mut many[..]
+            };
             log_softmax(&logits[at..at + size], log_probs);
             let pick = match &mut stream {
                 None => {
@@ -82,6 +102,18 @@ impl ActionHeads {
 }
 
 impl ActionHeads {
+    /// Draws real numbers for one row of outputs `[2C]`, or takes their means; returns the logarithm of their density.
+    pub fn draw(&self, outputs: &[f32], mut stream: Option<&mut Stream>, moves: &mut [f32]) -> f32 {
+        let (means, log_deviations) = outputs.split_at(self.moves);
+        for ((slot, mean), log_deviation) in moves.iter_mut().zip(means).zip(log_deviations) {
+            *slot = match &mut stream {
+                Some(stream) => mean + libm::expf(*log_deviation) * stream.normal() as f32,
+                None => *mean,
+            };
+        }
+        log_density(means, log_deviations, moves)
+    }
+
     /// The best choice of each component by its values `[A]`, the first of equals.
     pub fn best(&self, values: &[f32], action: &mut [u8]) {
         let mut at = 0;
@@ -133,11 +165,33 @@ impl ActionHeads {
     }
 }
 
-/// x − max − ln Σ exp(x − max) for up to sixteen numbers: those of sixteen rows that are alike.
+/// ln √(2π).
+const HALF_LOG_TAU: f32 = 0.918_938_5;
+
+/// The logarithm of the density of real numbers: Σ −z²/2 − ln σ − ln √(2π) with z = (u − μ) / σ.
+pub(crate) fn log_density(means: &[f32], log_deviations: &[f32], moves: &[f32]) -> f32 {
+    let rows = means.iter().zip(log_deviations).zip(moves);
+    rows.fold(0.0, |sum, ((mean, log_deviation), u)| {
+        let z = (u - mean) * libm::expf(-log_deviation);
+        sum - (0.5 * z * z + log_deviation + HALF_LOG_TAU)
+    })
+}
+
+/// The entropy of real numbers: Σ ln σ + 1/2 + ln √(2π).
+pub(crate) fn entropy(log_deviations: &[f32]) -> f32 {
+    log_deviations.iter().fold(0.0, |sum, log_deviation| sum + (log_deviation + 0.5 + HALF_LOG_TAU))
+}
+
+/// x − max − ln Σ exp(x − max): as if these numbers were those of sixteen rows that are alike.
 #[inline]
 fn log_softmax(logits: &[f32], out: &mut [f32]) {
-    let mut columns = [f32x16::ZERO; LANES];
-    let columns = &mut columns[..logits.len()];
+    let (mut few, mut many) = ([f32x16::ZERO; LANES], Vec::new());
+    let columns = if logits.len() <= LANES {
+        &mut few[..logits.len()]
+    } else {
+        many.resize(logits.len(), f32x16::ZERO);
+        &mut many[..]
+    };
     columns.iter_mut().zip(logits).for_each(|(column, x)| *column = f32x16::splat(*x));
     log_softmax_of_rows(columns);
     out.iter_mut().zip(columns).for_each(|(out, column)| *out = column.to_array()[0]);

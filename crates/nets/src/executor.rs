@@ -46,7 +46,7 @@ use team::TeamNet;
 
 pub use mixer::{Distance, Mixer};
 pub use model::{Model, Part};
-pub use policy::{Act, Chooser, Evaluated, Independent, Policy};
+pub use policy::{Act, Chooser, Evaluated, Independent, Policy, Taken};
 pub use q_network::{QNetwork, one_hot};
 
 /// What a network sees: L steps of C sequences of N agents, rows ordered [L, C, N].

@@ -56,6 +56,10 @@ pub struct Features {
     pub vectors: Vec<f32>,
     /// [S, W] the state of the whole team, once per joint state.
     pub states: Vec<f32>,
+    /// [R, A] 1 for a choice that is allowed; empty if all are.
+    pub masks: Vec<u8>,
+    /// `[S]` 1 for a joint state that begins an episode: what is remembered ends there. Empty if none but the first one does.
+    pub firsts: Vec<u8>,
     /// `[R]` the frame that each agent sees the world in; empty if that is the world's own.
     pub symmetries: Vec<Symmetry>,
 }
@@ -100,6 +104,9 @@ impl FeatureSpec {
     /// Features of all agents of the given states, [Q·N] rows. The states are [Q, E, D] with statics [B, …] and goals [B, N, K] of
     /// the B episodes that they are of, episode innermost: state q is of episode q mod B.
     pub fn compute(&self, states: &JointState<'_>) -> Features {
+        if self.shape.marks > 0 {
+            return self.foreign_features(states);
+        }
         let (n, d, joint) = (self.shape.agents, self.shape.dims, self.shape.bodies * self.shape.dims);
         let (count, landmarks) = (states.positions.len() / joint, states.landmarks());
         let episodes = states.goals.len() / (n * self.shape.goals_per_agent);
@@ -251,6 +258,8 @@ impl Features {
         copy(&mut self.neighbours, &other.neighbours, from, count, rows);
         copy(&mut self.counts, &other.counts, from, count, rows);
         copy(&mut self.symmetries, &other.symmetries, from, count, rows);
+        copy(&mut self.masks, &other.masks, from, count, rows);
+        copy(&mut self.firsts, &other.firsts, from / agents, count / agents, rows / agents);
         copy(&mut self.vectors, &other.vectors, from, count, rows);
         copy(&mut self.states, &other.states, from / agents, count / agents, rows / agents);
     }

@@ -4,6 +4,7 @@
 //! the gradient silently (layer norm: huggingface/candle #2977, #3011, #2168; PR #3823 would mend it).
 //! docs/dependencies.md lists why each operation is ours and when it may go.
 
+mod action_log_densities;
 mod action_log_probs;
 mod attention;
 mod buffer;
@@ -21,6 +22,7 @@ mod picks;
 mod pool;
 mod simd;
 
+pub use action_log_densities::action_log_densities;
 pub use action_log_probs::action_log_probs;
 pub use attention::{Attention, attention};
 pub(crate) use attention::{Keys, attend};

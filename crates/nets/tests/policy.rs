@@ -8,7 +8,7 @@ use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::statics::Statics;
 use magex_core::task::{RewardTarget, Spawn, TaskConfig};
 use magex_nets::distribution::ActionHeads;
-use magex_nets::executor::{Act, Chooser, Evaluated, Input, Model, Policy};
+use magex_nets::executor::{Act, Chooser, Evaluated, Input, Model, Policy, Taken};
 use magex_nets::features::Features;
 use magex_nets::ops::{self, Activation, GraphNoise};
 use magex_nets::params::{ParamBuilder, Params, to_safetensors};
@@ -62,7 +62,7 @@ impl Act for Decoder {
 }
 
 impl Policy for Decoder {
-    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
+    fn evaluate(&self, input: &Input<'_>, Taken { choices: actions, .. }: Taken<'_>) -> Result<Evaluated> {
         let both = ops::action_log_probs(&self.logits(input, actions)?, actions.to_vec(), &self.heads)?;
         Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: None })
     }
@@ -119,6 +119,9 @@ fn features(model: &Model, task: &TaskConfig) -> Arc<Features> {
         positions: &normal(STATES * s.bodies * s.dims, 1),
         velocities: &normal(STATES * s.bodies * s.dims, 2),
         agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
         statics: landmarks.view(),
         goals: &(0..STATES).flat_map(|_| 0..AGENTS as u32).collect::<Vec<_>>(),
     }))
@@ -148,7 +151,7 @@ fn earlier_actions_of_a_decoder_reach_later_agents_and_evaluation_agrees_with_ac
         sampler
     };
     let free = act(None);
-    let evaluated = decoder.evaluate(&input(&features, 0), &free.actions).unwrap();
+    let evaluated = decoder.evaluate(&input(&features, 0), Taken::choices(&free.actions)).unwrap();
     assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), free.log_probs);
     // The same streams, another first agent: the others have other probabilities.
     let other = act(Some(4));
@@ -211,7 +214,7 @@ fn a_loaded_policy_acts_as_the_one_that_was_written_and_evaluation_agrees_with_a
         };
         let (actions, log_probs, states) = act(own.as_ref());
         assert_eq!(act(loaded.as_ref()), (actions.clone(), log_probs.clone(), states.clone()));
-        let evaluated = own.evaluate(&input(&features, model.memory()), &actions).unwrap();
+        let evaluated = own.evaluate(&input(&features, model.memory()), Taken::choices(&actions)).unwrap();
         let kind = config.executor.kind;
         assert_eq!(evaluated.log_probs.to_vec1::<f32>().unwrap(), log_probs, "{kind}");
         assert_eq!(flat(evaluated.states), states, "{kind}");
@@ -229,7 +232,7 @@ fn a_decoding_transformer_hears_the_agents_before_and_no_agent_after() {
     let mut parts = [ParamBuilder::with(params[0].tensors().unwrap())];
     let policy = model.policy(&mut parts).unwrap();
     let evaluate = |actions: &[u8]| -> Vec<f32> {
-        policy.evaluate(&input(&features, 0), actions).unwrap().entropies.to_vec1().unwrap()
+        policy.evaluate(&input(&features, 0), Taken::choices(actions)).unwrap().entropies.to_vec1().unwrap()
     };
     let base = evaluate(&[0; STATES * AGENTS]);
     for changed in 0..AGENTS {
@@ -253,7 +256,7 @@ fn the_gradient_of_the_transformer_is_its_slope_in_every_tensor() {
     // Both ways through the network: log-probabilities and entropies, and values.
     let loss = |tensors: &[Tensor]| -> Tensor {
         let part = || [ParamBuilder::with(tensors.to_vec())];
-        let now = model.policy(&mut part()).unwrap().evaluate(&input(&features, 0), &actions).unwrap();
+        let now = model.policy(&mut part()).unwrap().evaluate(&input(&features, 0), Taken::choices(&actions)).unwrap();
         let values = model.value(&mut part()).unwrap().forward(&input(&features, 0)).unwrap().out;
         let probe = ops::constant(normal(STATES * AGENTS, 9), 1).unwrap();
         let policy = ((now.log_probs + now.entropies).unwrap() * probe.flatten_all().unwrap()).unwrap();

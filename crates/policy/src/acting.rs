@@ -406,6 +406,9 @@ impl Joint {
             positions: &self.positions,
             velocities: &self.velocities,
             agent_state: &self.agent_state,
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: self.statics.view(),
             goals: &self.goals,
         }

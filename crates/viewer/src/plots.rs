@@ -127,7 +127,7 @@ impl Plot {
             scale,
             log: false,
             series: metric.series().map(|(column, kind)| Series { column, place: column, kind }).collect(),
-            always: metric.scope == Scope::EveryTask,
+            always: matches!(metric.scope, Scope::EveryTask | Scope::Landmarks | Scope::Success),
             picture: true,
             format: metric.format,
         })

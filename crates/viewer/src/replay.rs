@@ -62,10 +62,12 @@ mod tests {
                 agent_state: 0,
                 goals_per_agent: 1,
                 action_components: 1,
+                ..Shape::default()
             },
             positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
             agent_state: vec![],
             statics: Statics::landmarks(2, 2, vec![0.5, 0.0, 1.0, 0.0]),
+            pictures: Vec::new(),
             goals: vec![0, 1],
         }
     }

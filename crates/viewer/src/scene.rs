@@ -258,6 +258,7 @@ mod tests {
             positions: vec![0.0; 10],
             agent_state: Vec::new(),
             statics: Statics::landmarks(5, 2, vec![0.0; 10]),
+            pictures: Vec::new(),
             goals: vec![0; 5],
         };
         let packed = Scene::of(&task).pack(String::new(), &recording, None).unwrap();

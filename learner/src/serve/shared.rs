@@ -67,7 +67,7 @@ impl Shared {
         let registry = Arc::new(Metrics::new());
         let metrics = Arc::new(LearnerMetrics::new(&registry));
         Self {
-            work: Work::new(first_lease, run.lease, sampling, metrics.clone()),
+            work: Work::new(first_lease, run.lease, sampling, metrics.clone()).hedging(limits.task.pure()),
             roster: Roster::new(limits.max_actors),
             control: Control::new(),
             status: RunStatusCache::new(),

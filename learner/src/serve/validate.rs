@@ -7,7 +7,7 @@ use magex_core::ids::RunId;
 use magex_core::metrics_table::METRICS;
 use magex_core::statics::StaticSpec;
 use magex_core::task::TaskConfig;
-use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory};
+use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, Shape, ShardResult, Trajectory, mark};
 use magex_proto::convert::{ConvertError, Delivery, decode_result};
 
 /// The shapes of a run's results, and the limits of the service.
@@ -31,6 +31,9 @@ pub struct Limits {
     pub recompute: f64,
 }
 
+/// Room for the pictures of a recorded episode, bytes.
+const PICTURES_BYTES: usize = 64 << 20;
+
 /// Default of [`Limits::recompute`].
 pub const RECOMPUTE: f64 = 0.01;
 
@@ -40,7 +43,7 @@ impl Limits {
         let action_heads = task.action_heads();
         let shape = task.shape(max_episodes);
         let metrics = std::array::from_fn(|row| METRICS[row].applies(task));
-        let recompute = RECOMPUTE;
+        let recompute = if task.pure() { RECOMPUTE } else { 0.0 };
         Self {
             task: task.clone(),
             shape,
@@ -60,10 +63,13 @@ impl Limits {
         let state = (t + 1) * b * s.bodies * s.dims;
         let agent_state = (t + 1) * b * n * s.agent_state;
         let statics: usize = self.statics.iter().map(|spec| spec.shape.iter().product::<usize>()).sum();
-        let floats = 2 * state + agent_state + b * statics + 2 * t * b * n + 3 * b * s.goals_per_agent;
+        let external = t * b * n * s.moves + (t + 1) * b * s.world_state;
+        let floats = 2 * state + agent_state + external + b * statics + 2 * t * b * n + 3 * b * s.goals_per_agent;
         let metrics = b * METRICS.len();
         let goals = b * n * s.goals_per_agent;
-        4 * (floats + metrics + goals) + t * b * n * s.action_components + 64 * 1024
+        let flags = t * b * n * (s.action_components + s.masks) + (t + 1) * b * n * s.marks;
+        let pictures = if self.task.external().is_ok_and(|external| external.renders) { PICTURES_BYTES } else { 0 };
+        4 * (floats + metrics + goals) + flags + pictures + 64 * 1024
     }
 }
 
@@ -102,9 +108,30 @@ fn check_trajectory(limits: &Limits, trajectory: &Trajectory) -> Result<(), Conv
             return Err(ConvertError::new(format!("trajectory.actions[{place}]"), problem));
         }
     }
+    check_masks(limits, trajectory)?;
     check_one_to_one(trajectory)?;
     check_metrics("trajectory.metrics", limits, &trajectory.metrics)?;
     plausible::check(limits, trajectory)
+}
+
+/// Checks that agents that act took choices that were allowed.
+fn check_masks(limits: &Limits, trajectory: &Trajectory) -> Result<(), ConvertError> {
+    let (width, heads) = (trajectory.shape.masks, limits.action_heads.len().max(1));
+    if width == 0 {
+        return Ok(());
+    }
+    let rows = trajectory.actions.chunks_exact(heads).zip(trajectory.masks.chunks_exact(width)).enumerate();
+    for (row, (action, masks)) in rows.filter(|(row, _)| trajectory.marks[*row] & mark::ACTIVE != 0) {
+        let mut from = 0;
+        for (component, (&choice, &size)) in action.iter().zip(&limits.action_heads).enumerate() {
+            if masks[from + usize::from(choice)] == 0 {
+                let field = format!("trajectory.actions[{}]", row * heads + component);
+                return Err(ConvertError::new(field, format!("{choice} was forbidden")));
+            }
+            from += size;
+        }
+    }
+    Ok(())
 }
 
 /// Checks that in every stage no two agents have the same goal.

@@ -72,6 +72,12 @@ impl Work {
         }
     }
 
+    /// Whether the shard of a late lease is leased once more: only if it is pure.
+    pub(crate) fn hedging(self, pure: bool) -> Self {
+        self.with_ledger(|ledger| ledger.hedges = pure);
+        self
+    }
+
     /// Changes the ledger, updates its metrics, and wakes sessions if shards were queued and the training thread if the plan
     /// ended.
     pub(crate) fn update<T>(&self, change: impl FnOnce(&mut OpenWork) -> T) -> T {

@@ -4,7 +4,7 @@ use candle_core::{Device, Result as CandleResult, Tensor};
 use magex_core::joint_state::JointState;
 use magex_core::keys::episode_keys;
 use magex_core::rng::sequence;
-use magex_core::trajectory::{Shape, Trajectory};
+use magex_core::trajectory::{Shape, Trajectory, mark};
 use magex_nets::executor::Input;
 use magex_nets::features::{FeatureSpec, Features};
 use magex_nets::ops::{self, GraphNoise};
@@ -24,6 +24,12 @@ pub struct Batch {
     pub log_probs: Vec<f32>,
     /// [E, T, N]
     pub rewards: Vec<f32>,
+    /// [E, T, N, C] real numbers of the actions.
+    pub moves: Vec<f32>,
+    /// [E, T+1, N] see [`mark`]; empty if every agent acts in every step and episodes end at the horizon only.
+    pub marks: Vec<u8>,
+    /// [E, T, N] 1 for an agent that acts in that state, otherwise 0; empty with `marks`.
+    pub active: Vec<f32>,
     /// `[E]` bases of the keys of the graph's noise; step t of episode e uses `sequence(base, t)`.
     pub noise: Vec<u64>,
 }
@@ -43,6 +49,9 @@ impl Batch {
             actions: Vec::with_capacity(rows * shape.action_components),
             log_probs: Vec::with_capacity(rows),
             rewards: Vec::with_capacity(rows),
+            moves: Vec::with_capacity(rows * shape.moves),
+            marks: Vec::new(),
+            active: Vec::new(),
             noise: Vec::with_capacity(episodes.len()),
         };
         let (n, h) = (shape.agents, shape.action_components);
@@ -52,6 +61,14 @@ impl Batch {
                 batch.actions.extend_from_slice(&t.actions[at * h..(at + n) * h]);
                 batch.log_probs.extend_from_slice(&t.log_probs[at..at + n]);
                 batch.rewards.extend_from_slice(&t.rewards[at..at + n]);
+                batch.moves.extend_from_slice(&t.moves[at * shape.moves..(at + n) * shape.moves]);
+            }
+            if shape.marks > 0 {
+                let states = (0..=shape.steps).map(|step| (step * t.shape.episodes + b) * n);
+                states.for_each(|at| batch.marks.extend_from_slice(&t.marks[at..at + n]));
+                let own = &batch.marks[batch.marks.len() - (shape.steps + 1) * n..];
+                let acts = |mark: &u8| f32::from(u8::from(mark & mark::ACTIVE != 0));
+                batch.active.extend(own[..shape.steps * n].iter().map(acts));
             }
             batch.noise.push(episode_keys(seed, &t.shard, *b as u32).graph.stream().bits64());
         }
@@ -75,6 +92,31 @@ impl Batch {
         (0..steps)
             .flat_map(|l| units.iter().map(move |&(episode, start)| sequence(self.noise[episode], (start + l) as u32)))
             .collect()
+    }
+
+    /// The marks [T+1, N] of an episode.
+    pub(crate) fn marks_of(&self, episode: usize) -> &[u8] {
+        let states = (self.shape.steps + 1) * self.shape.agents * self.shape.marks;
+        &self.marks[episode * states..(episode + 1) * states]
+    }
+
+    /// The entries of a [E, T, N] array that are of agents that act.
+    pub(crate) fn acting(&self, values: &[f32], units: &[(usize, usize)], steps: usize) -> Vec<f32> {
+        let mut rows = self.rows(values, 1, units, steps);
+        if !self.active.is_empty() {
+            let mut active = self.rows(&self.active, 1, units, steps).into_iter();
+            rows.retain(|_| active.next() == Some(1.0));
+        }
+        rows
+    }
+
+    /// How many they are.
+    pub(crate) fn samples(&self, units: &[(usize, usize)], steps: usize) -> f32 {
+        if self.active.is_empty() {
+            return (units.len() * steps * self.shape.agents) as f32;
+        }
+        // A sum of ones: exact.
+        self.rows(&self.active, 1, units, steps).into_iter().sum()
     }
 
     /// Rows of a [E, T, N, width] array for the same states, ordered [L, C, N, width].
@@ -118,6 +160,18 @@ impl Slice<'_> {
 
     pub(crate) fn actions(&self) -> Vec<u8> {
         self.batch.rows(&self.batch.actions, self.batch.shape.action_components, self.units, self.chunk)
+    }
+
+    pub(crate) fn moves(&self) -> Vec<f32> {
+        self.batch.rows(&self.batch.moves, self.batch.shape.moves, self.units, self.chunk)
+    }
+
+    /// 1 for rows of agents that act, otherwise 0; `None` if all do.
+    pub(crate) fn active(&self) -> CandleResult<Option<Tensor>> {
+        if self.batch.active.is_empty() {
+            return Ok(None);
+        }
+        self.column(&self.batch.active).map(Some)
     }
 
     /// The episode of a row of the policy's outputs: one per agent, or one per team.
@@ -166,17 +220,26 @@ pub(crate) fn column(values: Vec<f32>) -> CandleResult<Tensor> {
 fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
     let s = &t.shape;
     // The rows of one episode out of [T+1, B, width].
-    let episode = |data: &[f32], width: usize| -> Vec<f32> {
-        let rows = (0..=s.steps).flat_map(|step| {
-            let at = (step * s.episodes + b) * width;
+    fn rows<T: Copy>(data: &[T], (steps, episodes, b): (usize, usize, usize), width: usize) -> Vec<T> {
+        let rows = (0..steps).flat_map(|step| {
+            let at = (step * episodes + b) * width;
             &data[at..at + width]
         });
         rows.copied().collect()
-    };
+    }
+    let place = (s.steps + 1, s.episodes, b);
+    let episode = |data: &[f32], width: usize| rows(data, place, width);
+    let marks = rows(&t.marks, place, s.marks * s.agents);
+    let mut masks = rows(&t.masks, (s.steps, s.episodes, b), s.agents * s.masks);
+    // Nobody acts in the last state.
+    masks.resize((s.steps + 1) * s.agents * s.masks, 1);
     spec.compute(&JointState {
         positions: &episode(&t.positions, s.bodies * s.dims),
         velocities: &episode(&t.velocities, s.bodies * s.dims),
         agent_state: &episode(&t.agent_state, s.agents * s.agent_state),
+        world_states: &episode(&t.world_states, s.world_state),
+        masks: &masks,
+        marks: &marks,
         statics: t.statics.episode(b),
         goals: &t.goals[b * s.agents * s.goals_per_agent..(b + 1) * s.agents * s.goals_per_agent],
     })

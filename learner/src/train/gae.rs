@@ -1,5 +1,7 @@
 //! Generalised advantage estimation (Schulman et al. 2016) and the running normalisation of value targets.
 
+use magex_core::trajectory::mark;
+
 /// Rewards, values and discount of one agent's episode.
 #[derive(Debug, Clone, Copy)]
 pub struct Gae {
@@ -17,12 +19,27 @@ impl Gae {
     ///
     /// `rewards` `[T]`, `values` [T+1] where the last one is V of the true last state, before any reset. `stride` steps
     /// over interleaved agents: element t of this agent is at index t · stride.
-    pub fn run(&self, rewards: &[f32], values: &[f32], stride: usize, advantages: &mut [f32], returns: &mut [f32]) {
+    ///
+    /// `marks` [T+1], interleaved like the rest, say where episodes end in between ([`mark`]): after an end the value of the next
+    /// state counts as zero, after a cut it is bootstrapped (it is that of the true last state), and neither lets a later
+    /// advantage pass. Empty: nowhere.
+    pub fn run(
+        &self,
+        (rewards, values, marks): (&[f32], &[f32], &[u8]),
+        stride: usize,
+        advantages: &mut [f32],
+        returns: &mut [f32],
+    ) {
         let steps = rewards.len().div_ceil(stride);
         let mut next_advantage = 0.0;
         for t in (0..steps).rev() {
             let (at, after) = (t * stride, (t + 1) * stride);
-            let next_value = if t + 1 == steps && !self.bootstrap { 0.0 } else { values[after] };
+            let next = marks.get(after).copied().unwrap_or(mark::ACTIVE);
+            if next & mark::ACTIVE == 0 {
+                next_advantage = 0.0;
+            }
+            let over = next & mark::TERMINATED != 0 || (t + 1 == steps && !self.bootstrap);
+            let next_value = if over { 0.0 } else { values[after] };
             let delta = rewards[at] + self.gamma * next_value - values[at];
             next_advantage = delta + self.gamma * self.lambda * next_advantage;
             advantages[at] = next_advantage;
@@ -88,11 +105,23 @@ mod tests {
         // γ = 0.5, λ = 0.5, rewards 1, 2; values 1, 3, 4.
         let gae = Gae { gamma: 0.5, lambda: 0.5, bootstrap: true };
         let (mut a, mut r) = ([0.0; 2], [0.0; 2]);
-        gae.run(&[1.0, 2.0], &[1.0, 3.0, 4.0], 1, &mut a, &mut r);
+        gae.run((&[1.0, 2.0], &[1.0, 3.0, 4.0], &[]), 1, &mut a, &mut r);
         // δ_1 = 2 + 2 − 3 = 1; δ_0 = 1 + 1.5 − 1 = 1.5; A_0 = 1.5 + 0.25·1.
         assert_eq!((a, r), ([1.75, 1.0], [2.75, 4.0]));
-        Gae { bootstrap: false, ..gae }.run(&[1.0, 2.0], &[1.0, 3.0, 4.0], 1, &mut a, &mut r);
+        Gae { bootstrap: false, ..gae }.run((&[1.0, 2.0], &[1.0, 3.0, 4.0], &[]), 1, &mut a, &mut r);
         assert_eq!(a[1], -1.0);
+    }
+
+    #[test]
+    fn an_end_has_no_future_and_a_cut_has_the_value_of_its_last_state() {
+        let gae = Gae { gamma: 0.5, lambda: 0.5, bootstrap: true };
+        let (mut a, mut r) = ([0.0; 4], [0.0; 4]);
+        // Step 0 ends (or is cut) in state 1, in which nobody acts; states 2 and 3 are of the next episode.
+        for (ending, first) in [(mark::TERMINATED, 1.0 - 1.0), (mark::TRUNCATED, 1.0 + 0.5 * 3.0 - 1.0)] {
+            let marks = [mark::ACTIVE | mark::FIRST, ending, mark::ACTIVE | mark::FIRST, mark::ACTIVE, mark::ACTIVE];
+            gae.run((&[1.0, 0.0, 2.0, 4.0], &[1.0, 3.0, 5.0, 6.0, 8.0], &marks), 1, &mut a, &mut r);
+            assert_eq!((a[0], a[3], a[2]), (first, 4.0 + 4.0 - 6.0, 2.0 + 3.0 - 5.0 + 0.25 * 2.0));
+        }
     }
 
     #[test]
@@ -102,7 +131,7 @@ mod tests {
         let rewards = [1.0, 10.0, 2.0, 20.0, 3.0, 30.0];
         let values = [0.5, 5.0, 0.1, 1.0, 0.2, 2.0, 4.0, 40.0];
         for agent in 0..2 {
-            gae.run(&rewards[agent..], &values[agent..], 2, &mut a[agent..], &mut r[agent..]);
+            gae.run((&rewards[agent..], &values[agent..], &[]), 2, &mut a[agent..], &mut r[agent..]);
         }
         let expected = 1.0 + 0.9 * 2.0 + 0.81 * 3.0 + 0.729 * 4.0;
         assert!((r[0] - expected).abs() < 1e-5 && (r[1] - 10.0 * expected).abs() < 1e-4);

@@ -17,6 +17,7 @@
 //! | 12 | a minibatch is cut into a fixed number of slices whose gradients are added in their order | ours: the number of threads does not reach a number |
 //! | 13 | log-probabilities that the first minibatch (with memories: every chunk) does not reproduce refuse the batch before anything is changed | ours |
 //! | 14 | a minibatch with a loss or a gradient that is not finite is skipped | ours |
+//! | 15 | rows of agents that do not act (their episode is over, the next one has not begun) count nowhere | on-policy, `active_masks` |
 
 mod sums;
 
@@ -29,7 +30,7 @@ use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Result as CandleResult, Tensor, Var};
 use magex_core::config::RunConfig;
 use magex_core::rng::{Key, Purpose};
-use magex_nets::executor::{self as nets, Model, Part, Policy};
+use magex_nets::executor::{self as nets, Model, Part, Policy, Taken};
 use magex_nets::features::{FeatureSpec, Features};
 use magex_nets::ops::{self, GraphNoise};
 use magex_nets::params::{ParamBuilder, ParamError, Params};
@@ -139,13 +140,15 @@ impl Mappo {
         for (episode, evaluation) in evaluations.iter().enumerate() {
             let raw: Vec<f32> = evaluation.values.iter().map(|v| v * deviation + mean).collect();
             let (from, to) = (episode * steps * n, (episode + 1) * steps * n);
+            let marks = batch.marks_of(episode);
             for agent in 0..n {
                 let (advantages, returns) = (&mut advantages[from + agent..to], &mut returns[from + agent..to]);
-                gae.run(&batch.rewards[from + agent..to], &raw[agent..], n, advantages, returns);
+                let columns = (&batch.rewards[from + agent..to], &raw[agent..], marks.get(agent..).unwrap_or_default());
+                gae.run(columns, n, advantages, returns);
             }
             old_values.extend_from_slice(&evaluation.values[..steps * n]);
         }
-        normalise(&mut advantages);
+        normalise(&mut advantages, &batch.active);
 
         // 3. Epochs over shuffled minibatches of chunks.
         let units: Vec<(usize, usize)> =
@@ -159,11 +162,14 @@ impl Mappo {
             Key::new(self.config.run.seed, Purpose::Shuffle, &[iteration, epoch]).stream().shuffle(&mut order);
             for index in 0..minibatches {
                 let units = &order[part(order.len(), minibatches, index)];
-                let samples = (units.len() * self.chunk * n) as f32;
+                let samples = batch.samples(units, self.chunk);
+                if samples == 0.0 {
+                    continue;
+                }
 
                 // 4. Value targets: the statistics take in this minibatch first.
                 let statistics = *value_norm;
-                value_norm.update(batch.rows(&returns, 1, units, self.chunk).into_iter());
+                value_norm.update(batch.acting(&returns, units, self.chunk).into_iter());
                 let moments = value_norm.moments();
 
                 // 5. Gradients of both losses, slice by slice.
@@ -236,7 +242,8 @@ impl Mappo {
                 let slice = Slice { batch, units: &[(episode, start)], chunk: self.chunk, samples: 0.0 };
                 let features = slice.features();
                 let input = slice.input(&features, hidden.clone(), slice.noise());
-                let now = policy.evaluate(&input, &slice.actions())?;
+                let (choices, moves) = (slice.actions(), slice.moves());
+                let now = policy.evaluate(&input, Taken { choices: &choices, moves: &moves })?;
                 out.extend(now.log_probs.to_vec1::<f32>()?);
                 hidden = last_state(now.states.as_ref(), hidden)?;
             }
@@ -266,8 +273,10 @@ impl Mappo {
                 out.value_memory.extend_from_slice(&value_hidden);
                 value_hidden = last_state(output.states.as_ref(), value_hidden)?;
                 let input = slice.input(&features, policy_hidden.clone(), slice.noise());
-                let now = policy.evaluate(&input, &slice.actions())?;
-                let differences = (now.log_probs - slice.column(&batch.log_probs)?)?.to_vec1::<f32>()?;
+                let (choices, moves) = (slice.actions(), slice.moves());
+                let now = policy.evaluate(&input, Taken { choices: &choices, moves: &moves })?;
+                let differences = (now.log_probs - slice.column(&batch.log_probs)?)?;
+                let differences = only(slice.active()?.as_ref(), differences)?.to_vec1::<f32>()?;
                 out.error = differences.into_iter().fold(out.error, worse);
                 policy_hidden = last_state(now.states.as_ref(), policy_hidden)?;
             }
@@ -288,17 +297,22 @@ impl Mappo {
     ) -> Result<(Gradients, PolicySums)> {
         let m = &self.config.mappo;
         let hidden = slice.memories(|episode| &evaluations[episode].policy_memory);
-        let now = policy.evaluate(&slice.input(features, hidden, slice.noise()), &slice.actions())?;
+        let (choices, moves) = (slice.actions(), slice.moves());
+        let taken = Taken { choices: &choices, moves: &moves };
+        let now = policy.evaluate(&slice.input(features, hidden, slice.noise()), taken)?;
 
-        let log_ratio = (now.log_probs - slice.column(&slice.batch.log_probs)?)?;
+        // Rows of agents that do not act have the ratio 1, no advantage and no entropy.
+        let active = slice.active()?;
+        let log_ratio = only(active.as_ref(), (now.log_probs - slice.column(&slice.batch.log_probs)?)?)?;
+        let entropies = only(active.as_ref(), now.entropies)?;
         let (log_ratio, advantages, entropies, agents) = if m.joint_ratio {
             let agents = slice.batch.shape.agents;
             let sum = |x: &Tensor| sum_of_rows(&x.reshape(((), agents))?);
             let mean = |x: &Tensor| sum(x)? / agents as f64;
-            let (advantages, entropies) = (mean(&slice.column(advantages)?)?, mean(&now.entropies)?);
+            let (advantages, entropies) = (mean(&slice.column(advantages)?)?, mean(&entropies)?);
             (sum(&log_ratio)?, advantages, entropies, agents)
         } else {
-            (log_ratio, slice.column(advantages)?, now.entropies, 1)
+            (log_ratio, slice.column(advantages)?, entropies, 1)
         };
         let ratio = ops::exp(&log_ratio)?;
         let surrogate = clipped_surrogate(&ratio, &advantages, m.clip_epsilon)?;
@@ -329,6 +343,7 @@ impl Mappo {
         targets.iter_mut().for_each(|r| *r = (*r - mean) / deviation);
         let (targets, old_values) = (column(targets)?, slice.column(old_values)?);
         let losses = clipped_value_loss(&values, &old_values, &targets, m.clip_epsilon, m.huber_delta)?;
+        let losses = only(slice.active()?.as_ref(), losses)?;
         let loss = (losses.sum_all()? * (1.0 / f64::from(slice.samples)))?;
 
         Ok((gradients(networks, variables, &loss)?, sum(&losses)?))
@@ -404,14 +419,24 @@ fn check_log_probs(episode: usize, error: f64) -> std::result::Result<(), Suspec
     Err(Suspect { trajectory: episode, field: "log_probs", error, limit: LOG_PROB_TOLERANCE })
 }
 
-/// (A − mean) / (standard deviation + 1e-5) over all samples.
-fn normalise(advantages: &mut [f32]) {
-    let count = advantages.len().max(1) as f64;
-    let mean = advantages.iter().map(|&a| f64::from(a)).sum::<f64>() / count;
-    let variance = advantages.iter().map(|&a| (f64::from(a) - mean).powi(2)).sum::<f64>() / count;
+/// (A − mean) / (standard deviation + 1e-5) over the samples of agents that act (all, if `active` is empty); 0 for the others.
+fn normalise(advantages: &mut [f32], active: &[f32]) {
+    let acts = |place: usize| active.get(place).is_none_or(|active| *active != 0.0);
+    let acting = || advantages.iter().enumerate().filter(|(place, _)| acts(*place)).map(|(_, &a)| f64::from(a));
+    let count = acting().count().max(1) as f64;
+    let mean = acting().sum::<f64>() / count;
+    let variance = acting().map(|a| (a - mean).powi(2)).sum::<f64>() / count;
     let scale = 1.0 / (variance.sqrt() + 1e-5);
-    for a in advantages {
-        *a = ((f64::from(*a) - mean) * scale) as f32;
+    for (place, a) in advantages.iter_mut().enumerate() {
+        *a = if acts(place) { ((f64::from(*a) - mean) * scale) as f32 } else { 0.0 };
+    }
+}
+
+/// The rows of agents that act; 0 for the others.
+fn only(active: Option<&Tensor>, rows: Tensor) -> CandleResult<Tensor> {
+    match active {
+        Some(active) => rows * active,
+        None => Ok(rows),
     }
 }
 

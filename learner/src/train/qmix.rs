@@ -176,6 +176,9 @@ impl Qmix {
             positions: &episodes.positions,
             velocities: &episodes.velocities,
             agent_state: &episodes.agent_state,
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: episodes.statics.view(),
             goals: &episodes.goals,
         });

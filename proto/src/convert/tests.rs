@@ -43,6 +43,10 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
             agent_state: extra,
             goals_per_agent: k,
             action_components: h,
+            world_state: extra,
+            moves: extra,
+            masks: extra,
+            marks: extra.min(1),
         };
         let state = (t + 1) * b * e * d;
         let states = (floats(state), floats(state), floats(b * n * d), floats((t + 1) * b * n * extra));
@@ -60,6 +64,10 @@ fn trajectories() -> impl Strategy<Value = Trajectory> {
             actions: choices.1,
             log_probs: numbers.0,
             rewards: numbers.1,
+            moves: (0..t * b * n * extra).map(|x| x as f32 - 0.5).collect(),
+            masks: (0..t * b * n * extra).map(|x| (x % 2) as u8).collect(),
+            marks: (0..(t + 1) * b * n * extra.min(1)).map(|x| (x % 16) as u8).collect(),
+            world_states: (0..(t + 1) * b * extra).map(|x| x as f32).collect(),
             goal_log_probs: numbers.2,
             costs: numbers.3,
             exact_costs: numbers.4,
@@ -88,8 +96,9 @@ proptest! {
     #[test]
     fn an_evaluation_round_trips(shard in shards(), mut metrics in metrics(3), points in floats(3 * 2 * 2)) {
         metrics.truncate(shard.episodes as usize);
-        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, agent_state: 0, goals_per_agent: 1, action_components: 1 };
-        let recording = Recording { shape, statics: Statics::landmarks(2, 2, points[..4].to_vec()), positions: points, agent_state: vec![], goals: vec![1, 0] };
+        let shape = Shape { steps: 2, episodes: 1, agents: 2, bodies: 2, landmarks: 2, dims: 2, agent_state: 0, world_state: 0, moves: 0, masks: 0, marks: 0, goals_per_agent: 1, action_components: 1 };
+        let recording = Recording { shape, statics: Statics::landmarks(2, 2, points[..4].to_vec()), positions: points, agent_state: vec![], pictures: Vec::new(),
+            goals: vec![1, 0] };
         let outcome = ShardResult::Eval(EvalOutcome { shard, metrics, recording: shard.record.then_some(recording) });
         prop_assert_eq!(decode_result(encode_result(&RunId("r".into()), "abc", &outcome)).unwrap().result, outcome);
     }
@@ -137,8 +146,13 @@ fn a_wrong_field_is_named_by_its_path() {
         landmarks: 1,
         dims: 2,
         agent_state: 0,
+        world_state: 0,
+        moves: 0,
+        masks: 0,
+        marks: 0,
         goals_per_agent: 1,
         action_components: 1,
+        ..v1::Shape::default()
     };
     let body = v1::Trajectory {
         shape: Some(shape),

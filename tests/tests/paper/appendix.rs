@@ -61,6 +61,9 @@ fn appendix_a_2_the_literal_executor_sees_absolute_positions_and_ours_relative_o
                 positions: &positions,
                 velocities: &[0.5, 0.0],
                 agent_state: &[],
+                world_states: &[],
+                masks: &[],
+                marks: &[],
                 statics: statics.view(),
                 goals: &[0],
             })

@@ -22,12 +22,12 @@ fn section_3_1_rewards_are_discounted_and_advantages_are_generalised() {
     // Σ_l γ^l r_{t+l}: with λ = 1 and values of zero the return is that sum.
     let gae = Gae { gamma: mappo.gamma, lambda: 1.0, bootstrap: false };
     let (mut advantages, mut returns) = ([0.0; 3], [0.0; 3]);
-    gae.run(&[1.0, 2.0, 4.0], &[0.0; 4], 1, &mut advantages, &mut returns);
+    gae.run((&[1.0, 2.0, 4.0], &[0.0; 4], &[]), 1, &mut advantages, &mut returns);
     assert!((returns[0] - (1.0 + 0.99 * 2.0 + 0.99 * 0.99 * 4.0)).abs() < 1e-5, "{returns:?}");
     // Deviation: the horizon is a time limit and not an end, so the last state's value is bootstrapped by default; the
     // released code counts it as 0, and an observation without a clock cannot tell how far the end is.
     assert!(mappo.bootstrap_at_horizon);
-    Gae { bootstrap: true, ..gae }.run(&[0.0], &[0.0, 10.0], 1, &mut advantages, &mut returns);
+    Gae { bootstrap: true, ..gae }.run((&[0.0], &[0.0, 10.0], &[]), 1, &mut advantages, &mut returns);
     assert!((returns[0] - 9.9).abs() < 1e-5);
 }
 

@@ -46,8 +46,16 @@ pub(crate) fn act(config: &RunConfig, positions: &[f32], hidden: &[f32], noise: 
     let statics = Statics::landmarks(n, 2, (0..2 * n).map(|k| 0.3 * k as f32).collect());
     let goals: Vec<u32> = (0..n as u32).collect();
     let velocities = vec![0.0; positions.len()];
-    let states =
-        JointState { positions, velocities: &velocities, agent_state: &[], statics: statics.view(), goals: &goals };
+    let states = JointState {
+        positions,
+        velocities: &velocities,
+        agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
+        statics: statics.view(),
+        goals: &goals,
+    };
     let noise = noise.map_or(GraphNoise::Off, |key| GraphNoise::Keyed(Arc::new(vec![key])));
     let features = std::sync::Arc::new(mappo.spec().compute(&states));
     let input = Input { steps: 1, sequences: 1, agents: n, features: &features, hidden: hidden.to_vec(), noise };

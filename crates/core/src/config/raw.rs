@@ -1,11 +1,11 @@
 //! The configuration as it is written: TOML in which nearly every key may be missing.
 
 use super::{
-    Algorithm, CollectConfig, CommanderConfig, ConfigError, EPISODES_MAX, ExecutorConfig, MappoConfig, MaserConfig,
-    QmixConfig, RunConfig, RunSection, Setting,
+    Algorithm, CollectConfig, CommanderConfig, CommanderPolicy, ConfigError, EPISODES_MAX, ExecutorConfig,
+    ExecutorKind, MappoConfig, MaserConfig, QmixConfig, RunConfig, RunSection, Setting,
 };
 use crate::error::FieldError;
-use crate::task::{self, NOT_ZERO};
+use crate::task::{self, NOT_ZERO, TaskName};
 use crate::toml_table;
 use serde::Deserialize;
 use toml::{Table, Value};
@@ -65,6 +65,13 @@ pub(super) fn read(text: &str, settings: &[Setting]) -> Result<RunConfig, Config
     settings.iter().try_for_each(|setting| setting.apply(&mut file))?;
     refuse_renamed(&file)?;
     let sections: Sections = toml_table::read("", file, |_| None)?;
+    let mut sections = sections;
+    let external = sections.task.as_ref().and_then(|task| task.get("name")).and_then(Value::as_str);
+    if external == Some(TaskName::External.to_string().as_str()) {
+        // What fits an environment that has neither goals nor features of ours.
+        sections.executor.entry("kind").or_insert(ExecutorKind::Flat.to_string().into());
+        sections.commander.entry("kind").or_insert(CommanderPolicy::Exact.to_string().into());
+    }
     let task = sections.task.map_or_else(|| Ok(RunConfig::default().task), task::read)?;
     let collect: RawCollect = toml_table::read("collect", sections.collect, collect_bounds)?;
     let mut config = RunConfig {

@@ -30,7 +30,7 @@ impl Pace {
     fn of(task: &TaskConfig) -> Self {
         match task.action_code() {
             // 2 units/s, full speed; the velocity lags by 0.1 / (1 - 0.75) - 0.1 = 0.3 s.
-            ActionCode::Thrust => Self { per_cell: 1, ahead: 3 },
+            ActionCode::Thrust | ActionCode::Own => Self { per_cell: 1, ahead: 3 },
             // 1.5 m/s of at most 2; 1 / APPROACH + 0.28 s = 23 commands.
             ActionCode::PerAxis => Self { per_cell: 4, ahead: 23 },
         }
@@ -115,7 +115,7 @@ impl Controller for Astar {
                 _ => landmarks[landmark + d],
             };
             match self.task.action_code() {
-                ActionCode::Thrust => actions[0] = spread::steer(state, k, [0, 1].map(towards)),
+                ActionCode::Thrust | ActionCode::Own => actions[0] = spread::steer(state, k, [0, 1].map(towards)),
                 ActionCode::PerAxis => drones::steer(state, k, [0, 1, 2].map(towards), actions),
             }
         }

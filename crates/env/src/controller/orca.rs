@@ -28,7 +28,7 @@ fn settings(task: &TaskConfig) -> (Settings, f64) {
     };
     match task.action_code() {
         // An agent coasts 0.3 s and moves on for one step. A longer time horizon keeps agents off landmarks among parked ones.
-        ActionCode::Thrust => (Settings { time_horizon: 0.15, ..common }, 0.4),
+        ActionCode::Thrust | ActionCode::Own => (Settings { time_horizon: 0.15, ..common }, 0.4),
         // The radius leaves as much room as a drone has itself, because it follows late. 0.5 s: as the scripted pilot.
         ActionCode::PerAxis => (Settings { time_step: 1.0 / 30.0, radius: 0.12, ..common }, 0.5),
     }
@@ -72,7 +72,9 @@ impl Controller for Orca {
                 let near = neighbours(&settings, &positions, &by_x, agent);
                 let chosen = velocity(&settings, (&positions, &velocities), (agent, &near), add(preferred, noise));
                 match self.task.action_code() {
-                    ActionCode::Thrust => actions[0] = spread::accelerate(state, k, chosen.map(|v| v as f32)),
+                    ActionCode::Thrust | ActionCode::Own => {
+                        actions[0] = spread::accelerate(state, k, chosen.map(|v| v as f32))
+                    }
                     ActionCode::PerAxis => {
                         let up = f64::from(landmarks[dims * goal + 2]) - f64::from(state.positions[dims * k + 2]);
                         drones::command(state, k, actions, |d| if d < 2 { chosen[d] } else { up / approach });

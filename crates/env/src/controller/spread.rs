@@ -89,8 +89,16 @@ mod tests {
     fn arrays_that_do_not_fit_are_named() {
         let act = |velocities: &[f32], goals: &[u32]| {
             let landmarks = Statics::landmarks(2, 2, vec![0.0; 4]);
-            let state =
-                JointState { positions: &[0.0; 4], velocities, agent_state: &[], statics: landmarks.view(), goals };
+            let state = JointState {
+                positions: &[0.0; 4],
+                velocities,
+                agent_state: &[],
+                world_states: &[],
+                masks: &[],
+                marks: &[],
+                statics: landmarks.view(),
+                goals,
+            };
             SpreadScript::new(2).act(&state, &mut [0; 2])
         };
         let error = act(&[0.0; 3], &[0, 1]).unwrap_err();

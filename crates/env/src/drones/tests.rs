@@ -149,6 +149,9 @@ fn scripted(task: &TaskConfig, episodes: u32) -> (Drones, [f32; 2]) {
             positions: &positions,
             velocities: &velocities,
             agent_state: &agent_state,
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: statics.view(),
             goals: &goals,
         };

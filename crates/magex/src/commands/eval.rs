@@ -115,7 +115,7 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         for &seed in &seeds {
             let mut config = config.clone();
             (config.run.seed, config.task.spawn) = (seed, spawn);
-            let (policy, planning) = vary.policy(&config, &trained.weights)?;
+            let (policy, planning) = args.subject.policy(&config, &trained.weights)?;
             for &mode in modes.list() {
                 let clock = Instant::now();
                 let record = u32::from(args.record.is_some() && rows.is_empty());

@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ReplayArgs, options: &CommonOptions) -> anyhow::Result<
     args.out.as_deref().map_or(Ok(()), artifacts::check)?;
     let (trained, config) = args.subject.load()?;
     let vary = &args.subject.vary;
-    let (policy, _) = vary.policy(&config, &trained.weights)?;
+    let (policy, _) = args.subject.policy(&config, &trained.weights)?;
     note(format!("{} · N = {} · recording {} episodes", trained.name, config.task.agents, args.episodes));
     let mut episodes = Vec::new();
     for &mode in args.mode.list() {

@@ -3,6 +3,7 @@
 mod report;
 mod seeds;
 
+use crate::external::EnvironmentArgs;
 use crate::failure::usage;
 use crate::folder;
 use crate::options::CommonOptions;
@@ -32,6 +33,7 @@ Examples:
   magex train new.toml --from runs/mine    begin from the weights of a run
   magex train --in-process --json          one process; result as JSON
   magex train --http 127.0.0.1:8080        fixed port for the live page
+  magex train my.toml --environment 'python my_env.py'    an environment of your own
 
 The run folder gets config.toml, metrics.jsonl, checkpoints/, weights.safetensors, summary.json, recordings.json, \
     curve.svg, replay.html, tensorboard/, logs/ and .lock; README.md explains each. \
@@ -92,6 +94,8 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     print_config: bool,
     #[command(flatten)]
+    environment: EnvironmentArgs,
+    #[command(flatten)]
     overrides: Overrides,
 }
 
@@ -150,7 +154,7 @@ fn train(
     started: Instant,
 ) -> anyhow::Result<Result<Finished, PathBuf>> {
     let Configured { config, parent, whole_budget } = configured;
-    let (means, title) = means(args)?;
+    let (means, title) = means(args, &config)?;
     let plan = Plan::prepare(config, parent, args.out.as_deref(), args.resume, means)?;
     let mut progress = Progress::start(&plan.config, &title, &plan.folder.display().to_string());
     match plan.train(runtime, interrupted, &mut progress)? {
@@ -181,12 +185,15 @@ fn read(args: &TrainArgs) -> anyhow::Result<Configured> {
         return Err(usage("--from: the run has begun; leave out --from to continue it, or choose another --out"));
     }
     let parent = args.from.as_deref().map(Parent::read).transpose()?;
+    // A run that has begun says itself what its environment is; its actors compare.
+    let described = if own.is_some() { None } else { args.environment.describe()? };
+    let described = described.as_ref();
     let base = match (&args.config, own) {
-        (Some(path), _) => args.overrides.read(Some(path))?,
+        (Some(path), _) => args.overrides.read(Some(path), described)?,
         (None, Some(own)) => args.overrides.set(own)?,
         (None, None) => match &parent {
             Some(parent) => args.overrides.set(parent.config())?,
-            None => args.overrides.read(None)?,
+            None => args.overrides.read(None, described)?,
         },
     };
     let whole_budget = base.run.max_steps;
@@ -199,7 +206,8 @@ fn read(args: &TrainArgs) -> anyhow::Result<Configured> {
 }
 
 /// What trains, and what the head of the run says of it.
-fn means(args: &TrainArgs) -> anyhow::Result<(Means, String)> {
+fn means(args: &TrainArgs, config: &RunConfig) -> anyhow::Result<(Means, String)> {
+    let environments = args.environment.of_run(config)?;
     let http = (args.http != "off").then(|| args.http.clone());
     if let Some(listen) = &http {
         server::resolve(listen).map_err(|_| usage(format!("--http {listen}: give HOST:PORT, or off for no page")))?;
@@ -209,7 +217,9 @@ fn means(args: &TrainArgs) -> anyhow::Result<(Means, String)> {
         (None, format!("one process, {threads} threads"))
     } else {
         let plan = ActorPlan { actors: args.actors, threads: (processors() / args.actors).max(1) };
-        (Some(plan), format!("learner, commander and {} actors on this machine", args.actors))
+        let services = if config.task.stages().is_empty() { "learner" } else { "learner, commander" };
+        (Some(plan), format!("{services} and {} actors on this machine", args.actors))
     };
-    Ok((Means { threads, http, actors, command: COMMAND }, title))
+    let environment = (environments, args.environment.arguments());
+    Ok((Means { threads, http, actors, command: COMMAND, environment }, title))
 }

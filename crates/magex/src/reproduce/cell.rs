@@ -116,7 +116,8 @@ pub(crate) fn measure(place: &Place<'_>, cell: &Cell, seed: u64) -> anyhow::Resu
 /// Trains in this process until the run is complete, its wall time is spent or the command is interrupted.
 fn train(place: &Place<'_>, cell: &Cell, config: &RunConfig, folder: &Path) -> anyhow::Result<TrainEnd> {
     let spent = if RunFolderState::of(folder) == RunFolderState::Run { SeedRun::read(folder)?.wall_s() } else { 0.0 };
-    let means = Means { threads: place.threads, http: None, actors: None, command: COMMAND };
+    let means =
+        Means { threads: place.threads, http: None, actors: None, command: COMMAND, environment: Default::default() };
     let plan = Plan::prepare(config.clone(), None, Some(folder), true, means)?;
     // The wall time stops a training as Ctrl-C does: after an iteration, with a checkpoint.
     let stop = place.interrupted.child_token();

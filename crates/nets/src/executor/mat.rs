@@ -8,7 +8,7 @@
 mod cache;
 
 use super::memory::Norm;
-use super::{Act, Chooser, Evaluated, Input, Layer, Network, Output, Policy, RELU_GAIN};
+use super::{Act, Chooser, Evaluated, Input, Layer, Network, Output, Policy, RELU_GAIN, Taken};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
 use crate::ops::{Activation, Attention, action_log_probs, attention, constant, gelu, linear, with_values};
@@ -269,7 +269,7 @@ impl Act for Mat {
 }
 
 impl Policy for Mat {
-    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> CandleResult<Evaluated> {
+    fn evaluate(&self, input: &Input<'_>, Taken { choices: actions, .. }: Taken<'_>) -> CandleResult<Evaluated> {
         let encoded = self.encoder.forward(input)?;
         let features = match &self.decoder {
             None => encoded,

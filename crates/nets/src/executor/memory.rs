@@ -62,7 +62,9 @@ impl Memory {
     pub(super) fn forward(&self, x: Option<&Tensor>, input: &Input<'_>) -> CandleResult<Output> {
         let sequences = input.sequences * input.agents;
         let gates = self.gates.forward(x, input.features)?.reshape((input.steps, sequences, 3 * self.width))?;
-        let states = self.gru.forward(&gates, input.hidden.clone())?;
+        // The state of a world's agents ends with its episode.
+        let firsts = input.features.firsts.iter().flat_map(|first| std::iter::repeat_n(*first, input.agents)).collect();
+        let states = self.gru.forward(&gates, input.hidden.clone(), firsts)?;
         let flat = states.reshape((input.steps * sequences, self.width))?;
         Ok(Output { out: self.head.forward(Some(&flat), input.features)?, states: Some(states) })
     }

@@ -4,7 +4,7 @@ use super::mat::Mat;
 use super::{Act, Distance, Independent, Mixer, Network, Policy, QNetwork, build, feature_spec};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
-use crate::params::{Entry, ParamBuilder, ParamError, Params};
+use crate::params::{Entry, Init, ParamBuilder, ParamError, Params};
 use magex_core::config::{Algorithm, ExecutorKind, RunConfig};
 
 /// A named set of parameters with an optimiser of its own.
@@ -45,8 +45,11 @@ impl Model {
     /// The executor that a configuration names. `config.task` may have another team size than the weights were trained
     /// with, if the architecture allows it.
     pub fn new(config: &RunConfig) -> Result<Self, ParamError> {
-        let heads = ActionHeads::new(config.task.action_heads())
-            .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 16 choices".to_owned()))?;
+        let heads = match config.task.shape(1).moves {
+            0 => ActionHeads::new(config.task.action_heads())
+                .ok_or_else(|| ParamError::Mismatch("an action component must have 1 to 256 choices".to_owned()))?,
+            moves => ActionHeads::gaussian(moves),
+        };
         let spec = feature_spec(&config.executor, &config.task);
         Ok(Self { config: config.clone(), spec, heads })
     }
@@ -105,9 +108,14 @@ impl Model {
         if self.whole() {
             return Ok(Box::new(Mat::build(&self.config.executor, &self.spec, &self.heads, &mut parts[0])?));
         }
-        let (heads, head) = (self.heads.clone(), (self.heads.logits(), 0.01));
-        let network = build(&self.config.executor, &self.spec, head, false, &mut parts[0])?;
-        Ok(Box::new(Independent { network, heads }))
+        let (heads, moves) = (self.heads.clone(), self.heads.moves());
+        let outputs = if moves > 0 { moves } else { heads.logits() };
+        let network = build(&self.config.executor, &self.spec, (outputs, 0.01), false, &mut parts[0])?;
+        let log_deviations = match moves {
+            0 => None,
+            _ => Some(parts[0].tensor("log_deviations", &[1, moves], Init::Constant(0.0))?),
+        };
+        Ok(Box::new(Independent { network, heads, log_deviations }))
     }
 
     /// The value function on the given parameters, one builder per part: one output per agent, in normalised units.

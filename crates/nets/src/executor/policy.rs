@@ -2,13 +2,30 @@
 
 use super::{Input, Network};
 use crate::distribution::ActionHeads;
-use crate::ops::{action_log_probs, with_values};
+use crate::ops::{self, Activation, action_log_densities, action_log_probs, with_values};
 use candle_core::{Result, Tensor};
 
 /// Chooses actions: from a random stream, or the most likely one. It keeps what it chose.
 pub trait Chooser {
-    /// Chooses the action of one row of the batch, `[H]`, given its logits, or action values, `[A]`. Every row is asked for once.
+    /// Chooses the action of one row of the batch, `[H]`, given its logits, or action values, `[A]`. Every row is asked for once. An
+    /// action of real numbers is kept by the chooser; then there is nothing to return.
     fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8];
+}
+
+/// Given actions of R rows.
+#[derive(Debug, Clone, Copy)]
+pub struct Taken<'a> {
+    /// [R, H]
+    pub choices: &'a [u8],
+    /// [R, C]
+    pub moves: &'a [f32],
+}
+
+impl<'a> Taken<'a> {
+    /// Actions that are choices.
+    pub fn choices(choices: &'a [u8]) -> Self {
+        Self { choices, moves: &[] }
+    }
 }
 
 /// What a policy thinks of given actions, differentiable in its parameters.
@@ -33,20 +50,48 @@ pub trait Act: Send + Sync {
 /// A policy of all agents. `evaluate` is given all actions and gives the same log-probabilities for them as `act`, to the bit: the
 /// first importance ratio is exactly 1.
 pub trait Policy: Act {
-    /// Evaluates the actions [R, H] of every row of the batch.
-    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated>;
+    /// Evaluates the actions of every row of the batch.
+    fn evaluate(&self, input: &Input<'_>, actions: Taken<'_>) -> Result<Evaluated>;
 }
 
 /// Agents act independently of each other, given what they see: one network computes the logits of all rows at once.
 pub struct Independent {
     pub(super) network: Box<dyn Network>,
     pub(super) heads: ActionHeads,
+    /// [1, C] logarithms of the standard deviations of actions of real numbers, the same in every state.
+    pub(super) log_deviations: Option<Tensor>,
+}
+
+/// What is taken off the logit of a choice that is forbidden: its probability underflows to 0, and nothing becomes infinite.
+const FORBIDDEN: f32 = 1e9;
+
+impl Independent {
+    /// The outputs of the network as a distribution: forbidden choices out of reach, standard deviations beside the means.
+    fn outputs(&self, input: &Input<'_>, out: Tensor) -> Result<Tensor> {
+        let rows = out.dim(0)?;
+        if let Some(log_deviations) = &self.log_deviations {
+            // A product with ones: its gradient is a sum in an order of ours.
+            let width = log_deviations.dim(1)?;
+            let (ones, zeros) = (ops::constant(vec![1.0; rows], 1)?, Tensor::zeros(width, out.dtype(), out.device())?);
+            let spread = ops::linear(&ones, log_deviations, &zeros, Activation::Identity, true)?;
+            return Tensor::cat(&[&out, &spread], 1);
+        }
+        let masks = &input.features.masks;
+        if masks.is_empty() {
+            return Ok(out);
+        }
+        let numbers = |of: fn(u8) -> f32| {
+            ops::constant(masks.iter().map(|mask| of(*mask)).collect::<Vec<_>>(), self.heads.logits())
+        };
+        let (keep, away) = (numbers(f32::from)?, numbers(|mask| if mask == 0 { -FORBIDDEN } else { 0.0 })?);
+        (out * keep)? + away
+    }
 }
 
 impl Act for Independent {
     fn act(&self, input: &Input<'_>, choose: &mut dyn Chooser) -> Result<Option<Tensor>> {
         let output = self.network.forward(input)?;
-        with_values(&output.out, |logits| {
+        with_values(&self.outputs(input, output.out)?, |logits| {
             for (row, logits) in logits.chunks_exact(self.heads.logits()).enumerate() {
                 choose.choose(row, logits);
             }
@@ -56,9 +101,13 @@ impl Act for Independent {
 }
 
 impl Policy for Independent {
-    fn evaluate(&self, input: &Input<'_>, actions: &[u8]) -> Result<Evaluated> {
+    fn evaluate(&self, input: &Input<'_>, actions: Taken<'_>) -> Result<Evaluated> {
         let output = self.network.forward(input)?;
-        let both = action_log_probs(&output.out, actions.to_vec(), &self.heads)?;
+        let out = self.outputs(input, output.out)?;
+        let both = match self.log_deviations {
+            Some(_) => action_log_densities(&out, actions.moves.to_vec())?,
+            None => action_log_probs(&out, actions.choices.to_vec(), &self.heads)?,
+        };
         Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: output.states })
     }
 }

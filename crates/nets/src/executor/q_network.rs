@@ -98,7 +98,7 @@ impl QNetwork {
             Second::Memory(input, gru) => {
                 let rows = vectors.len() / width / steps;
                 let gates = input.forward(&first)?.reshape((steps, rows, 3 * self.hidden))?;
-                let states = gru.forward(&gates, memory)?;
+                let states = gru.forward(&gates, memory, Vec::new())?;
                 (states.reshape((steps * rows, self.hidden))?, Some(states))
             }
         };

@@ -2,6 +2,8 @@
 
 use super::{FeatureSpec, Features, State, offset};
 use magex_core::config::Observes;
+use magex_core::joint_state::JointState;
+use magex_core::trajectory::mark;
 
 /// What the flat observation vector holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +28,9 @@ impl FeatureSpec {
                 Observes::Goals => s.goals_per_agent,
             };
             let index = if flat.agent_index { s.agents } else { 0 };
+            if s.marks > 0 {
+                return s.agent_state + index;
+            }
             (2 + targets + s.agents - 1) * s.dims + s.agent_state + index
         })
     }
@@ -33,8 +38,32 @@ impl FeatureSpec {
     /// W: width of the state of the whole team, 0 if no critic sees it.
     pub fn state_width(&self) -> usize {
         let s = &self.shape;
-        let width = (2 * s.bodies + s.landmarks) * s.dims + s.agents * s.agent_state;
+        let width = match (s.marks, s.world_state) {
+            (0, _) => (2 * s.bodies + s.landmarks) * s.dims + s.agents * s.agent_state,
+            (_, 0) => s.agents * s.agent_state,
+            (_, width) => width,
+        };
         self.flat.filter(|flat| flat.states).map_or(0, |_| width)
+    }
+
+    /// What an external environment lets agents see: its observations as they are, and the state of the world or, where there is
+    /// none, the observations of all agents.
+    pub(super) fn foreign_features(&self, states: &JointState<'_>) -> Features {
+        let s = &self.shape;
+        let index = self.flat.is_some_and(|flat| flat.agent_index);
+        let mut out = Features { masks: states.masks.to_vec(), ..Features::default() };
+        out.vectors.reserve(states.marks.len() * self.vector_width());
+        for row in 0..states.marks.len() {
+            out.vectors.extend_from_slice(&states.agent_state[row * s.agent_state..(row + 1) * s.agent_state]);
+            if index {
+                out.vectors.extend((0..s.agents).map(|j| f32::from(u8::from(j == row % s.agents))));
+            }
+        }
+        if self.state_width() > 0 {
+            out.states = if s.world_state > 0 { states.world_states } else { states.agent_state }.to_vec();
+        }
+        out.firsts = states.marks.chunks(s.agents).map(|marks| u8::from(marks[0] & mark::FIRST != 0)).collect();
+        out
     }
 
     /// Velocity / speed, position, then offsets: to the landmarks and the balls (or to the agent's own goals), to the other

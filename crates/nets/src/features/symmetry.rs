@@ -57,6 +57,7 @@ impl Symmetry {
                     *thrust = 1 + 2 * axis + (negative ^ u8::from(self.mirror[usize::from(axis)]));
                 }
             }
+            ActionCode::Own => {}
             ActionCode::PerAxis => {
                 if let [x, y, ..] = action {
                     if self.swap {

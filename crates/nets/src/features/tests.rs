@@ -11,7 +11,16 @@ fn spec(neighbours: usize, agents: usize) -> FeatureSpec {
 /// Features of particle states whose episodes have these landmarks.
 fn see(spec: &FeatureSpec, positions: &[f32], velocities: &[f32], landmarks: &[f32], goals: &[u32]) -> Features {
     let statics = Statics::landmarks(spec.shape.landmarks, 2, landmarks.to_vec());
-    spec.compute(&JointState { positions, velocities, agent_state: &[], statics: statics.view(), goals })
+    spec.compute(&JointState {
+        positions,
+        velocities,
+        agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
+        statics: statics.view(),
+        goals,
+    })
 }
 
 #[test]
@@ -112,6 +121,9 @@ fn a_drone_sees_its_closest_approach_and_no_drone_that_is_out() {
         positions: &positions,
         velocities: &velocities,
         agent_state: &agent_state,
+        world_states: &[],
+        masks: &[],
+        marks: &[],
         statics: landmarks.view(),
         goals: &[0, 1, 2],
     };

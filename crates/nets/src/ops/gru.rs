@@ -31,10 +31,11 @@ impl Gru {
     }
 
     /// Over a sequence: `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `h0` [R·H] the state that enters the sequence
-    /// (constant: the gradient is truncated there). Returns all states [L, R, H].
-    pub fn forward(&self, input: &Tensor, h0: Vec<f32>) -> Result<Tensor> {
+    /// (constant: the gradient is truncated there), `firsts` [L, R] 1 where a sequence begins anew from a state of zeros (empty:
+    /// nowhere). Returns all states [L, R, H].
+    pub fn forward(&self, input: &Tensor, h0: Vec<f32>, firsts: Vec<u8>) -> Result<Tensor> {
         let keep = [input, &self.weight, &self.bias].into_iter().any(Tensor::track_op);
-        let op = Op { h0, packs: self.packs.clone(), keep, saved: OnceLock::new() };
+        let op = Op { h0, firsts, packs: self.packs.clone(), keep, saved: OnceLock::new() };
         apply3(op, [input, &self.weight, &self.bias])
     }
 }
@@ -44,6 +45,7 @@ const TILE: usize = 48;
 
 struct Op {
     h0: Vec<f32>,
+    firsts: Vec<u8>,
     packs: Arc<Packs>,
     /// Whether there will be a gradient.
     keep: bool,
@@ -55,6 +57,29 @@ struct Op {
 fn sizes(x: &Arg<'_>) -> Result<(usize, usize, usize)> {
     let [steps, rows, triple] = *x.dims else { bail!("gru: input {:?} is not [L, R, 3H]", x.dims) };
     Ok((steps, rows, triple / 3))
+}
+
+impl Op {
+    /// Zeros the rows of a tile, in `out`, whose sequences begin with step t. `None` if none does.
+    fn begun<'a>(
+        &self,
+        old: &[f32],
+        t: usize,
+        (rows, hidden): (usize, usize),
+        tile: &Range<usize>,
+        out: &'a mut Vec<f32>,
+    ) -> Option<&'a [f32]> {
+        let firsts = self.firsts.get(t * rows + tile.start..t * rows + tile.end)?;
+        if firsts.iter().all(|first| *first == 0) {
+            return None;
+        }
+        out.clear();
+        out.extend_from_slice(old);
+        for (row, _) in firsts.iter().enumerate().filter(|(_, first)| **first != 0) {
+            out[row * hidden..(row + 1) * hidden].fill(0.0);
+        }
+        Some(out)
+    }
 }
 
 fn tiles(rows: usize) -> impl Iterator<Item = Range<usize>> {
@@ -74,6 +99,7 @@ impl Operation<3> for Op {
         let mut states = vec![0.0; steps * rows * hidden];
         let mut saved = Buffer::take(if self.keep { steps * rows * 4 * hidden } else { 4 * hidden });
         let mut recurrent = Buffer::take(TILE.min(rows) * triple);
+        let mut begun = Vec::new();
         for tile in tiles(rows) {
             for t in 0..steps {
                 let (before, now) = states.split_at_mut(t * rows * hidden);
@@ -81,16 +107,17 @@ impl Operation<3> for Op {
                     0 => &self.h0[..],
                     _ => &before[(t - 1) * rows * hidden..],
                 };
-                let old = Rows::new(&before[tile.start * hidden..tile.end * hidden], hidden);
+                let old = &before[tile.start * hidden..tile.end * hidden];
+                let old = self.begun(old, t, (rows, hidden), &tile, &mut begun).unwrap_or(old);
                 let u = &mut recurrent[..tile.len() * triple];
-                layer(old, pack, Start::Bias(b.values), Activation::Identity, u, triple, tile.len());
-                for (r, u) in tile.clone().zip(u.chunks_exact(triple)) {
+                layer(Rows::new(old, hidden), pack, Start::Bias(b.values), Activation::Identity, u, triple, tile.len());
+                for (i, (r, u)) in tile.clone().zip(u.chunks_exact(triple)).enumerate() {
                     let at = t * rows + r;
                     let keep = if self.keep { at } else { 0 };
                     gates(
                         &x.values[at * triple..][..triple],
                         u,
-                        &before[r * hidden..][..hidden],
+                        &old[i * hidden..][..hidden],
                         &mut now[r * hidden..][..hidden],
                         &mut saved[keep * 4 * hidden..][..4 * hidden],
                     );
@@ -114,6 +141,7 @@ impl Operation<3> for Op {
         let mut du = Buffer::take(TILE.min(rows) * triple);
         let mut dh = Buffer::take(TILE.min(rows) * hidden);
         let mut gradient = Gradient::new(hidden, triple);
+        let mut begun = Vec::new();
         for tile in tiles(rows) {
             let dh = &mut dh[..tile.len() * hidden];
             dh.fill(0.0);
@@ -123,6 +151,7 @@ impl Operation<3> for Op {
                     _ => &states[(t - 1) * rows * hidden..],
                 };
                 let before = &before[tile.start * hidden..tile.end * hidden];
+                let before = self.begun(before, t, (rows, hidden), &tile, &mut begun).unwrap_or(before);
                 for (i, r) in tile.clone().enumerate() {
                     let at = t * rows + r;
                     gate_gradients(
@@ -137,6 +166,12 @@ impl Operation<3> for Op {
                 let du = Rows::new(&du[..tile.len() * triple], triple);
                 gradient.add(Rows::new(before, hidden), du, tile.len());
                 layer(du, transposed, Start::Output, Activation::Identity, dh, hidden, tile.len());
+                // A sequence that began here has no step before.
+                if let Some(firsts) = self.firsts.get(t * rows + tile.start..t * rows + tile.end) {
+                    for (row, _) in firsts.iter().enumerate().filter(|(_, first)| **first != 0) {
+                        dh[row * hidden..(row + 1) * hidden].fill(0.0);
+                    }
+                }
             }
         }
         let (mut dw, mut db) = (vec![0.0; hidden * triple], vec![0.0; triple]);

@@ -89,8 +89,42 @@ fn recurrent_unit() {
     let h0 = normal(3 * 16, 4);
     check(&[&x, &w, &b], &|| {
         let unit = ops::Gru::new(w.as_tensor().clone(), b.as_tensor().clone());
-        unit.forward(&x, h0.clone()).unwrap()
+        unit.forward(&x, h0.clone(), Vec::new()).unwrap()
     });
+    // Sequences that begin anew: at the first step, in the middle, at the last one.
+    let mut firsts = vec![0; 4 * 3];
+    [2, 3, 7, 9].into_iter().for_each(|place| firsts[place] = 1);
+    let unit = || ops::Gru::new(w.as_tensor().clone(), b.as_tensor().clone());
+    check(&[&x, &w, &b], &|| unit().forward(&x, h0.clone(), firsts.clone()).unwrap());
+    // They are those of a sequence of their own.
+    let whole = unit().forward(&x, h0.clone(), firsts).unwrap();
+    let own = unit().forward(
+        &x.narrow(0, 1, 3).unwrap().narrow(1, 0, 1).unwrap().contiguous().unwrap(),
+        vec![0.0; 16],
+        Vec::new(),
+    );
+    let two = |x: &Tensor| x.narrow(0, 0, 2).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(two(&whole.narrow(0, 1, 2).unwrap().narrow(1, 0, 1).unwrap().contiguous().unwrap()), two(&own.unwrap()));
+}
+
+#[test]
+fn log_densities_of_actions_have_the_bits_of_the_draw() {
+    let (rows, outputs) = (5, var(&[5, 6], 1));
+    let heads = ActionHeads::gaussian(3);
+    let mut stream = Key::new(1, Purpose::Action, &[]).stream();
+    let values = outputs.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let (mut moves, mut drawn) = (vec![0.0; rows * 3], Vec::new());
+    for (row, moves) in values.chunks_exact(6).zip(moves.chunks_exact_mut(3)) {
+        drawn.push(heads.draw(row, Some(&mut stream), moves));
+    }
+    let both = ops::action_log_densities(&outputs, moves.clone()).unwrap();
+    assert_eq!(both.get(0).unwrap().to_vec1::<f32>().unwrap(), drawn);
+    check(&[&outputs], &|| ops::action_log_densities(&outputs, moves.clone()).unwrap());
+    // A standard normal: -ln 2π / 2 - u² / 2, and its entropy (1 + ln 2π) / 2.
+    let standard = Tensor::zeros((1, 2), DType::F32, &Device::Cpu).unwrap();
+    let values =
+        ops::action_log_densities(&standard, vec![1.0]).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert!((values[0] + 1.418_938_5).abs() < 1e-6 && (values[1] - 1.418_938_5).abs() < 1e-6);
 }
 
 #[test]
@@ -243,6 +277,9 @@ impl States {
             positions: &self.positions[from * state..to * state],
             velocities: &self.velocities[from * state..to * state],
             agent_state: &self.agent_state[from * s.agents * s.agent_state..to * s.agents * s.agent_state],
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: self.statics.episodes(from..to),
             goals: &self.goals[from * s.agents * s.goals_per_agent..to * s.agents * s.goals_per_agent],
         }

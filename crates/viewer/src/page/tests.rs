@@ -94,6 +94,10 @@ fn outcome(version: u32, record: bool) -> EvalOutcome {
         landmarks: 2,
         dims: 2,
         agent_state: 0,
+        world_state: 0,
+        moves: 0,
+        masks: 0,
+        marks: 0,
         goals_per_agent: 1,
         action_components: 1,
     };
@@ -113,6 +117,7 @@ fn outcome(version: u32, record: bool) -> EvalOutcome {
         positions: vec![0.0, 0.0, 1.0, 1.0, 0.1, 0.0, 1.0, 0.9],
         agent_state: vec![],
         statics: Statics::landmarks(2, 2, vec![0.5, 0.0, 1.0, 0.0]),
+        pictures: Vec::new(),
         goals: vec![0, 1],
     };
     EvalOutcome { shard, metrics: vec![], recording: record.then_some(recording) }

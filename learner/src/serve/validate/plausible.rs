@@ -45,7 +45,9 @@ fn check_rewards(limits: &Limits, t: &Trajectory) -> Result<(), ConvertError> {
         let problem = format!("{} is outside {low}..={high}, which the reward's coefficients give", t.rewards[place]);
         return Err(ConvertError::new(format!("trajectory.rewards[{place}]"), problem));
     }
-    for (b, metrics) in t.metrics.iter().enumerate() {
+    // An external environment's metrics are of the first episode of each world.
+    let whole = shape.marks == 0;
+    for (b, metrics) in t.metrics.iter().enumerate().filter(|_| whole) {
         let row = |step: usize| &t.rewards[(step * shape.episodes + b) * shape.agents..][..shape.agents];
         let sum: f64 = (0..shape.steps).flat_map(row).map(|&reward| f64::from(reward)).sum();
         let mean = sum / (shape.steps * shape.agents).max(1) as f64;

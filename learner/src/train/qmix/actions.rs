@@ -39,6 +39,9 @@ impl Qmix {
             positions: &t.positions[..s.steps * s.episodes * s.bodies * s.dims],
             velocities: &t.velocities[..s.steps * s.episodes * s.bodies * s.dims],
             agent_state: &t.agent_state[..s.steps * rows * s.agent_state],
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: t.statics.view(),
             goals: &t.goals,
         });

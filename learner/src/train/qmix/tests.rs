@@ -155,6 +155,9 @@ fn it_solves_a_monotone_matrix_game() {
         positions: &episodes.positions,
         velocities: &episodes.velocities,
         agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
         statics: episodes.statics.view(),
         goals: &episodes.goals,
     });

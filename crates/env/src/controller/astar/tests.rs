@@ -217,6 +217,9 @@ fn plans_of_the_papers_teams_have_no_conflicts() {
             positions: &positions,
             velocities: &velocities,
             agent_state: &[],
+            world_states: &[],
+            masks: &[],
+            marks: &[],
             statics: env.statics().view(),
             goals: &goals,
         };

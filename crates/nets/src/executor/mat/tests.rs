@@ -65,6 +65,9 @@ fn transformer(agents: usize, states: usize) -> (Mat, Arc<Features>) {
         positions: &numbers(states * agents * 2, 2),
         velocities: &numbers(states * agents * 2, 3),
         agent_state: &[],
+        world_states: &[],
+        masks: &[],
+        marks: &[],
         statics: landmarks.view(),
         goals: &(0..states).flat_map(|_| 0..agents as u32).collect::<Vec<_>>(),
     }));
