@@ -33,7 +33,10 @@ pub struct Environment {
     worlds: usize,
     client: EnvironmentServiceClient<Channel>,
     requests: mpsc::Sender<v1::EnvironmentRequest>,
-    replies: tonic::Streaming<v1::EnvironmentReply>,
+    /// `None` until the first request: a server in Python sends the head of its answer with the first answer.
+    replies: Option<tonic::Streaming<v1::EnvironmentReply>>,
+    /// What the stream of requests is made of, until then.
+    unsent: Option<mpsc::Receiver<v1::EnvironmentRequest>>,
     /// The calls of one thread: they run on it.
     runtime: Runtime,
     /// Last: it ends after the connection.
@@ -83,20 +86,16 @@ impl Environment {
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let (requests, received) = mpsc::channel(1);
         let opened = runtime.block_on(async {
-            let opening = async {
-                let described = client.describe(v1::DescribeRequest { protocol: PROTOCOL }).await?.into_inner();
-                let replies = client.run(ReceiverStream::new(received)).await?.into_inner();
-                Ok::<_, Status>((described, replies))
-            };
-            tokio::time::timeout(timeout, opening).await
+            tokio::time::timeout(timeout, client.describe(v1::DescribeRequest { protocol: PROTOCOL })).await
         });
-        let (described, replies) = match opened {
-            Ok(Ok(opened)) => opened,
+        let described = match opened {
+            Ok(Ok(described)) => described.into_inner(),
             Ok(Err(status)) => return Err(gone(process.as_mut(), &status)),
             Err(_) => return Err(lost(format!("it did not describe itself within {} s", timeout.as_secs()))),
         };
         let (description, steps_max) = (description::read(&described)?, described.steps_max);
-        Ok(Self { description, steps_max, timeout, worlds: 0, client, requests, replies, runtime, process })
+        let (replies, unsent) = (None, Some(received));
+        Ok(Self { description, steps_max, timeout, worlds: 0, client, requests, replies, unsent, runtime, process })
     }
 
     /// What it says about itself.
@@ -155,12 +154,19 @@ impl Environment {
             Body::Step(_) => "step",
             Body::Render(_) => "render",
         };
-        let (requests, replies) = (&self.requests, &mut self.replies);
+        let (requests, replies, unsent, client) =
+            (&self.requests, &mut self.replies, &mut self.unsent, &mut self.client);
         let answer = self.runtime.block_on(async {
             let asking = async {
                 let request = v1::EnvironmentRequest { request: Some(request) };
                 requests.send(request).await.map_err(|_| Status::unavailable("its connection is closed"))?;
-                replies.message().await
+                if let Some(unsent) = unsent.take() {
+                    *replies = Some(client.run(ReceiverStream::new(unsent)).await?.into_inner());
+                }
+                match replies {
+                    Some(replies) => replies.message().await,
+                    None => Err(Status::unavailable("its connection is closed")),
+                }
             };
             tokio::time::timeout(self.timeout, asking).await
         });

@@ -195,7 +195,7 @@ pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
     };
     let name = raw.name.ok_or_else(|| missing("name"))?;
     let external = name == TaskName::External;
-    if external && raw.spawn.is_some() {
+    if external && raw.spawn.is_some_and(|spawn| spawn != Spawn::Uniform) {
         return Err(FieldError::new("task.spawn", "the environment starts its episodes itself; remove it"));
     }
     if external && !raw.sections.contains_key(name.definition().section) {
@@ -339,13 +339,12 @@ impl TaskConfig {
     /// Sizes of the arrays of a shard of B = `episodes` episodes.
     pub fn shape(&self, episodes: usize) -> Shape {
         let external = self.external().ok();
-        let placed = if external.is_some() { 0 } else { self.agents };
         Shape {
             steps: self.horizon as usize,
             episodes,
             agents: self.agents,
-            bodies: placed + self.balls(),
-            landmarks: placed,
+            bodies: self.agents + self.balls(),
+            landmarks: self.agents,
             dims: self.dims(),
             agent_state: self.agent_state(),
             goals_per_agent: self.stages().len(),

@@ -83,6 +83,7 @@ pub(crate) fn run(args: &CheckEnvironmentArgs, options: &CommonOptions) -> anyho
         "steps_max": steps_max,
         "violations": list(&wrong),
         "remarks": list(&remarks),
+        "checked": checked.checked,
         "episodes": checked.episodes,
         "steps": checked.steps,
     }));
@@ -123,7 +124,8 @@ fn properties(d: &ExternalConfig, steps_max: u32) -> Vec<(&'static str, String)>
 
 fn report(output: &Output, checked: &CheckReply, wrong: &[(String, String)], remarks: &[(String, String)], same: bool) {
     let CheckReply { episodes, steps, .. } = checked;
-    output.say(format!("\nplayed {steps} steps in {episodes} episodes; checked: {}", checked.checked.join(", ")));
+    let rules = checked.checked.len();
+    output.say(format!("\nplayed {steps} steps in {episodes} episodes; {rules} rules checked"));
     if same {
         output.say("the same seeds and actions gave the same bits in two processes");
     }
