@@ -151,6 +151,13 @@ impl Environments {
         }
     }
 
+    /// Starts one before it is needed.
+    pub fn prepare(&self) -> Result<(), EnvironmentError> {
+        let environment = self.take()?;
+        lock(&self.idle).push(environment);
+        Ok(())
+    }
+
     fn take(&self) -> Result<Environment, EnvironmentError> {
         if let Some(environment) = lock(&self.idle).pop() {
             return Ok(environment);

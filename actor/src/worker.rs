@@ -1,6 +1,6 @@
 //! The seam between the rollout pool and the rollout, and the worker of production.
 
-use crate::environment::{EnvironmentSource, Environments};
+use crate::environment::{EnvironmentError, EnvironmentSource, Environments};
 use crate::goal_client::{GoalError, GrpcGoals};
 use crate::pulse::Pulse;
 use crate::rollout::{Roller, RolloutError};
@@ -90,9 +90,19 @@ impl PolicyWorker {
     pub fn maker(source: Option<EnvironmentSource>) -> MakeWorker {
         Arc::new(move |welcome| {
             let mut worker = Self::new(welcome)?;
-            // One for each thread: what a thread leaves behind is no concern of another.
-            let external = worker.config.task.external().ok().zip(source.clone());
-            worker.environments = external.map(|(external, source)| Arc::new(Environments::new(source, external)));
+            if let Ok(external) = worker.config.task.external() {
+                let missing = || EnvironmentError::Missing(external.environment.clone());
+                let source = source.clone().ok_or_else(|| WorkError::fatal(missing().to_string()))?;
+                // One for each thread: what a thread leaves behind is no concern of another.
+                let environments = Environments::new(source, external);
+                // The wrong one never takes a shard; one that is not there yet may be there for the first shard.
+                match environments.prepare() {
+                    Err(error) if error.is_permanent() => return Err(WorkError::fatal(error.to_string())),
+                    Err(error) => tracing::warn!(reason = %error, "the environment is not there yet"),
+                    Ok(()) => {}
+                }
+                worker.environments = Some(Arc::new(environments));
+            }
             Ok(Box::new(worker))
         })
     }

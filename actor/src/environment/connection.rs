@@ -6,7 +6,7 @@ use super::process::Process;
 use super::{EnvironmentError, How};
 use magex_core::task::ExternalConfig;
 use magex_proto::v1;
-use magex_proto::v1::environment_problem::Kind;
+use magex_proto::v1::EnvironmentProblemKind as Kind;
 use magex_proto::v1::environment_reply::Reply;
 use magex_proto::v1::environment_request::Request as Body;
 use magex_proto::v1::environment_service_client::EnvironmentServiceClient;

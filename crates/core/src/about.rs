@@ -82,7 +82,15 @@ pub fn group_name(config: &RunConfig) -> String {
         crate::config::Algorithm::Mappo => config.executor.kind.to_string(),
         other => other.to_string(),
     };
-    format!("{}-{}-{system}", config.task.name, config.task.agents)
+    let task = match config.task.external() {
+        // A name of a folder.
+        Ok(external) => {
+            let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' };
+            external.environment.chars().map(plain).collect()
+        }
+        Err(_) => config.task.name.to_string(),
+    };
+    format!("{task}-{}-{system}", config.task.agents)
 }
 
 impl About {

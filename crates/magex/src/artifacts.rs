@@ -3,9 +3,11 @@
 use crate::failure::cannot_create;
 use anyhow::Context as _;
 use magex_core::config::RunConfig;
+use magex_core::task::TaskName;
 use magex_core::trajectory::{EpisodeMetrics, Recording};
 use magex_runtime::limits;
 use magex_viewer::curve::{curve_svg, parse_metrics};
+use magex_viewer::pictures::pictures_html;
 use magex_viewer::replay::replay_html;
 use rustix::fs::{Access, access};
 use std::path::Path;
@@ -13,6 +15,11 @@ use std::path::Path;
 /// Task, executor, scheduler and seed of a run on one line.
 pub(crate) fn describe(config: &RunConfig) -> String {
     let (task, commander) = (&config.task, config.commander.kind);
+    if let Ok(external) = task.external() {
+        let (name, agents, executor, seed) =
+            (&external.environment, task.agents, config.executor.kind, config.run.seed);
+        return format!("{name}, N = {agents} · executor {executor} · seed {seed}");
+    }
     format!(
         "{}, N = {}, {} · executor {} · scheduler {commander} · seed {}",
         task.definition().title,
@@ -38,11 +45,18 @@ pub(crate) fn write_replay(
     config: &RunConfig,
     episodes: &[(Recording, Option<EpisodeMetrics>)],
 ) -> anyhow::Result<()> {
-    write(path, replay_html(&config.task, title, subtitle, episodes)?.as_bytes())
+    let page = match config.task.name {
+        TaskName::External => pictures_html(title, subtitle, episodes)?,
+        _ => replay_html(&config.task, title, subtitle, episodes)?,
+    };
+    write(path, page.as_bytes())
 }
 
-/// Writes `replay.html` from the recordings in the run folder.
+/// Writes `replay.html` from the recordings in the run folder; an external environment that draws nothing has none.
 pub(crate) fn write_recorded_replay(folder: &Path, config: &RunConfig) -> anyhow::Result<()> {
+    if config.task.external().is_ok_and(|external| !external.renders) {
+        return Ok(());
+    }
     let source = folder.join("recordings.json");
     let bytes = std::fs::read(&source).with_context(|| source.display().to_string())?;
     let recordings: Vec<Recording> = serde_json::from_slice(&bytes).with_context(|| source.display().to_string())?;

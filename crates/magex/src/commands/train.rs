@@ -132,7 +132,10 @@ pub(crate) fn run(args: &TrainArgs, options: &CommonOptions) -> anyhow::Result<u
     runtime.shutdown_background();
     match end? {
         Ok(finished) => Ok(finished.report(output)),
-        Err(folder) => Ok(say_stopped(&folder, resume(&folder), output)),
+        Err(folder) => {
+            let environment = report::environment(&args.environment.arguments());
+            Ok(say_stopped(&folder, resume(&folder, &environment), output))
+        }
     }
 }
 

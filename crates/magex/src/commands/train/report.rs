@@ -26,6 +26,8 @@ pub(super) struct Finished {
     /// The budget before an option changed it.
     whole_budget: u64,
     command_s: f64,
+    /// The option that names the environment, if there is one.
+    environment: String,
 }
 
 impl Finished {
@@ -45,27 +47,31 @@ impl Finished {
             map.insert("page".into(), json!(progress.page));
         }
         let (config, folder) = (plan.config.clone(), plan.folder.clone());
-        Ok(Self { summary, value, config, folder, whole_budget, command_s })
+        let environment = environment(&plan.means.environment.1);
+        Ok(Self { summary, value, config, folder, whole_budget, command_s, environment })
     }
 
     pub(super) fn report(&self, output: Output) -> u8 {
         let (s, horizon) = (&self.summary, self.config.task.horizon);
-        let sampled = METRICS[SUCCESS_RATE].write(s.episodes.sampled_success_rate.unwrap_or_default());
+        let sampled = s.episodes.sampled_success_rate.map(|success| METRICS[SUCCESS_RATE].write(success));
         let metrics = METRICS.iter().zip(s.episodes.greedy).filter(|(metric, _)| metric.applies(&self.config.task));
         let row = |metric: &Metric, mean: f64| match metric.write_within(mean, horizon) {
             never if never == NEVER => (metric.label, never),
             value => (metric.label, format!("{value} {}", metric.unit)),
         };
         let mut rows: Vec<(&str, String)> = metrics.filter_map(|(metric, mean)| Some(row(metric, mean?))).collect();
-        rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
+        if let Some(sampled) = sampled {
+            rows.insert(SUCCESS_RATE + 1, ("sampled", sampled));
+        }
         rows.extend([
             ("joint env steps", format!("{} in {} iterations", thousands(s.joint_env_steps as f64), s.iterations)),
             ("training time", seconds(s.wall_s)),
             ("this command", seconds(self.command_s)),
         ]);
+        let has_success = METRICS[SUCCESS_RATE].applies(&self.config.task);
         let why = match s.target_reached {
             true => "Done: target reached",
-            false if self.config.run.target_success > 1.0 => "Done: budget spent",
+            false if self.config.run.target_success > 1.0 || !has_success => "Done: budget spent",
             false => "Budget spent before the target was reached",
         };
         output.say(format!("\n{why}.\nEvaluated on {} episodes with unseen starts:\n", s.final_episodes));
@@ -78,11 +84,14 @@ impl Finished {
             output.say(format!("\n{hint}"));
         }
         let (magex, out) = (program(), self.folder.display());
-        output.say(format!("\nNext:\n  {magex} eval {out}"));
+        let with = &self.environment;
+        output.say(format!("\nNext:\n  {magex} eval {out}{with}"));
         if !self.config.executor.kind.fixed_team_size() {
             output.say(format!("  {magex} eval {out} --agents {} --scheduler exact", 4 * self.config.task.agents));
         }
-        output.say(format!("  open {out}/replay.html and {out}/curve.svg"));
+        let replay =
+            if self.folder.join("replay.html").exists() { format!("{out}/replay.html and ") } else { String::new() };
+        output.say(format!("  open {replay}{out}/curve.svg"));
         output.result(&self.value);
         exit::OK
     }
@@ -104,9 +113,14 @@ fn not_learned(config: &RunConfig, whole: u64, summary: &Summary) -> Option<Stri
     })
 }
 
+/// The option that names the environment, as a shell reads it; empty if there is none.
+pub(super) fn environment(arguments: &[String]) -> String {
+    arguments.get(1).map_or_else(String::new, |text| format!(" --environment '{}'", text.replace('\'', "'\\''")))
+}
+
 /// The command that continues a run.
-pub(super) fn resume(out: &Path) -> String {
-    format!("{} train --resume --out {}", program(), out.display())
+pub(super) fn resume(out: &Path, environment: &str) -> String {
+    format!("{} train --resume --out {}{environment}", program(), out.display())
 }
 
 /// Says how a run continues.
