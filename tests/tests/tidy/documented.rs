@@ -9,7 +9,7 @@ pub(crate) fn configuration() -> String {
     // The tables tell the defaults of a file with a task, not those of the first run.
     let plain = RunConfig { run: RunSection::default(), mappo: MappoConfig::default(), ..RunConfig::default() };
     let mut config = plain.to_toml().unwrap();
-    for name in TaskName::SIMULATED.into_iter().filter(|&name| name != RunConfig::default().task.name) {
+    for name in TaskName::ALL.into_iter().filter(|&name| name != RunConfig::default().task.name) {
         let task = TaskConfig::of(name, 4, Spawn::Uniform);
         let other = RunConfig { task, ..RunConfig::default() }.to_toml().unwrap();
         let own = other.split("\n\n").find(|section| section.starts_with("[task.")).unwrap();
