@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import sysconfig
 import traceback
 
@@ -12,7 +11,7 @@ import numpy as np
 RAISED, BROKE_ITS_WORD, REQUEST = 1, 2, 3
 
 _HERE = os.path.dirname(os.path.abspath(__file__)) + os.sep
-_INSTALLED = tuple({sysconfig.get_path("stdlib") + os.sep, sysconfig.get_path("purelib") + os.sep, sys.base_prefix + os.sep})
+_INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "purelib", "platlib")})
 
 
 class Refused(Exception):

@@ -35,6 +35,7 @@ def serve(
     worlds: int | None = None,
     address: str | None = None,
     deterministic: bool | None = None,
+    successes: bool | None = None,
     pad: bool = False,
     renders: bool | None = None,
     tls_certificate: str | os.PathLike[str] | None = None,
@@ -50,7 +51,9 @@ def serve(
     * worlds: largest number of worlds that one caller may have; None is any.
     * address: HOST:PORT where an environment listens that no actor started; None is `--address` of the command line, or a free
       port of 127.0.0.1. An actor says by the environment variable MAGEX_ENVIRONMENT_SOCKET where to listen instead.
-    * deterministic: whether an episode is a function of its seed and its actions; None plays some to find out.
+    * deterministic: whether an episode is a function of its seed and its actions; None plays 200 steps to find out.
+    * successes: whether infos say at the end of an episode if it was a success (`is_success` or `success`); None looks in the
+      same steps. With both given nothing is played.
     * pad: fills up observations and actions of agents that have smaller spaces than others.
     * renders: False never renders; None renders if the environment's render_mode is "rgb_array".
     * tls_certificate, tls_key: PEM files, and token: what callers must present. Beyond loopback all three are needed, unless
@@ -58,7 +61,7 @@ def serve(
     """
     try:
         environment = Environment(make, worlds=worlds, pad=pad, renders=renders)
-        service = Service(environment, deterministic)
+        service = Service(environment, deterministic, successes)
         socket = os.environ.get(SOCKET)
         if socket:
             _serve_actor(service, socket)
