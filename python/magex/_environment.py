@@ -140,10 +140,10 @@ class Environment:
             if isinstance(env, GymnasiumVector)
             else type(env).render is not VectorEnvironment.render
         )
-        if any(codec.has_mask for codec in found.observations) or found.observations[0].shape is None and len(set(agents)) == 1:
+        if any(codec.shape is None for codec in found.observations):
             raise Refused(
-                f"observation_space: {short(found.observations[0].space)}; a vector environment needs a Box "
-                "(return masks from masks())"
+                f"observation_space: {short(found.observations[0].space)}; a vector environment needs a Box: "
+                "flatten it, and return masks from masks()"
             )
         worlds = found.worlds_max or 1
         try:
