@@ -273,8 +273,8 @@ class _Player:
             if not finite:
                 at = int(np.argmin(np.isfinite(row)))
                 report.add("finite", f"{who}: observation has {row[at]} as number {at}")
-            _dtypes(report, who, codec.inner, codec.numbers(value), "observation")
-            if finite and not _contains(codec.inner, codec.numbers(value)):
+            right = _dtypes(report, who, codec.inner, codec.numbers(value), "observation")
+            if finite and right and not _contains(codec.inner, codec.numbers(value)):
                 report.add("observations", f"{who}: observation is not in its space: {_outside(codec.inner, codec.numbers(value))}")
             self.returned.append((where, agent, value, copy.deepcopy(value)))
             if self.masks is not None and layout.own_masks:
@@ -437,20 +437,19 @@ def _outside(space: Any, value: Any) -> str:
     return f"{short(value)}, and the space is {short(space)}"
 
 
-def _dtypes(report: Report, who: str, space: Any, value: Any, field: str) -> None:
+def _dtypes(report: Report, who: str, space: Any, value: Any, field: str) -> bool:
+    """Whether all arrays have the dtype of their space."""
     name = kind(space)
     if name in ("Box", "MultiBinary", "MultiDiscrete"):
-        dtype = getattr(value, "dtype", None)
         if not isinstance(value, np.ndarray):
             report.add("dtypes", f"{who}: {field} is a {type(value).__name__}; return a NumPy array of {space.dtype}")
-        elif dtype != space.dtype:
-            report.add("dtypes", f"{who}: {field} has dtype {dtype}, and its space {space.dtype}")
-    elif name == "Dict":
-        for key, part in space.spaces.items():
-            _dtypes(report, who, part, value[key], f"{field}[{key!r}]")
-    elif name == "Tuple":
-        for key, part in enumerate(space.spaces):
-            _dtypes(report, who, part, value[key], f"{field}[{key!r}]")
+            return False
+        if value.dtype != space.dtype:
+            report.add("dtypes", f"{who}: {field} has dtype {value.dtype}, and its space {space.dtype}")
+            return False
+        return True
+    parts = space.spaces.items() if name == "Dict" else enumerate(space.spaces) if name == "Tuple" else ()
+    return all([_dtypes(report, who, part, value[key], f"{field}[{key!r}]") for key, part in parts])
 
 
 def _equal(a: Any, b: Any) -> bool:
