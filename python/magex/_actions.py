@@ -59,6 +59,10 @@ class ActionCodec:
         if one_sided.any():
             at = int(np.argmax(one_sided))
             raise Refused(f"{field}: number {at} has one bound, {self.low[at]} to {self.high[at]}; give both or none")
+        empty = self.low >= self.high
+        if empty.any():
+            at = int(np.argmax(empty))
+            raise Refused(f"{field}: number {at} lies between {self.low[at]} and {self.high[at]}; leave it out, or widen its bounds")
         self.size = len(self.low)
         if self.size == 0:
             raise Refused(f"{field}: has no numbers; give it one at least")

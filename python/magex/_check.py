@@ -71,6 +71,7 @@ class _Player:
         self.layout = layout
         self.report = report
         self.index = {agent: i for i, agent in enumerate(layout.agents)}
+        self.state_width = layout.state_width
         self.lasted: list[tuple[int, bool, bool]] = []
         # The last observations, and what they were when they were returned.
         self.returned: list[tuple[str, str, Any, Any]] = []
@@ -328,7 +329,8 @@ class _Player:
                 return
 
     def _state(self, env: Any, where: str) -> None:
-        width = self.layout.state_width
+        # What the first reset told, whatever has become of it.
+        width = self.state_width
         if isinstance(env, Alone):
             return
         if not width:
@@ -337,7 +339,7 @@ class _Player:
         try:
             state = np.asarray(env.state())
         except Exception as error:
-            self.report.add("state", f"{where}: state(): {describe(error)}")
+            self.report.add("state", f"{where}: state(): {describe(error)}; repair it, or serve with state=False")
             return
         if state.size != width:
             self.report.add("state", f"{where}: state() has {state.size} numbers, and {width} after the first reset")

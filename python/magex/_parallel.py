@@ -14,7 +14,7 @@ import numpy as np
 
 from magex._layout import Batch, Layout
 from magex._observations import Unfit
-from magex._problems import Problem, broke, names, raised, request, short
+from magex._problems import Problem, StateProblem, broke, names, raised, request, short
 
 
 class Alone:
@@ -311,10 +311,12 @@ class ParallelWorlds:
     def _state(self, w: int, world: _World, batch: Batch) -> None:
         if batch.states is None:
             return
-        state = self._call(w, "state", world.env.state)
-        flat = np.asarray(state).ravel()
-        if flat.shape != (self.layout.state_width,):
-            raise broke(w, None, "state()", f"{self.layout.state_width} numbers, as after the first reset", f"{flat.size}")
+        try:
+            flat = np.asarray(self._call(w, "state()", world.env.state)).ravel()
+            if flat.shape != (self.layout.state_width,):
+                raise broke(w, None, "state()", f"{self.layout.state_width} numbers, as after the first reset", flat.size)
+        except Problem as problem:
+            raise StateProblem(problem.kind, f"{problem.message}; serve with state=False if it is of no use", w) from problem
         batch.states[w] = flat
 
     # -- all worlds

@@ -9,6 +9,7 @@ import numpy as np
 
 from magex._environment import Environment, Worlds
 from magex._layout import Batch, Layout
+from magex._problems import StateProblem
 
 STEPS = 200
 #: Two episodes with these seeds are played in each of two worlds, in opposite order.
@@ -43,6 +44,15 @@ def play(environment: Environment, steps: int = STEPS) -> Found:
     the two episodes of one seed differ.
     """
     layout = environment.layout()
+    try:
+        return _play(environment, layout, steps)
+    except StateProblem:
+        # A state() that fails where an episode ends, for instance: the critic sees all observations instead.
+        layout.state_width = 0
+        return _play(environment, layout, steps)
+
+
+def _play(environment: Environment, layout: Layout, steps: int) -> Found:
     if layout.worlds_max == 1:
         return _one_after_another(environment, layout, steps)
     worlds = environment.worlds()

@@ -28,6 +28,10 @@ class Problem(Exception):
         self.world = world
 
 
+class StateProblem(Problem):
+    """state() failed, without which a team can be trained too."""
+
+
 def request(message: str) -> Problem:
     """The caller's fault."""
     return Problem(REQUEST, message)

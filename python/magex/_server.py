@@ -37,6 +37,7 @@ def serve(
     deterministic: bool | None = None,
     successes: bool | None = None,
     pad: bool = False,
+    state: bool = True,
     renders: bool | None = None,
     tls_certificate: str | os.PathLike[str] | None = None,
     tls_key: str | os.PathLike[str] | None = None,
@@ -55,12 +56,13 @@ def serve(
     * successes: whether infos say at the end of an episode if it was a success (`is_success` or `success`); None looks in the
       same steps. With both given nothing is played.
     * pad: fills up observations and actions of agents that have smaller spaces than others.
+    * state: False never asks for state(); the critic then sees all observations.
     * renders: False never renders; None renders if the environment's render_mode is "rgb_array".
     * tls_certificate, tls_key: PEM files, and token: what callers must present. Beyond loopback all three are needed, unless
       insecure=True.
     """
     try:
-        environment = Environment(make, worlds=worlds, pad=pad, renders=renders)
+        environment = Environment(make, worlds=worlds, pad=pad, state=state, renders=renders)
         service = Service(environment, deterministic, successes)
         socket = os.environ.get(SOCKET)
         if socket:

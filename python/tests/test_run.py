@@ -406,3 +406,26 @@ def test_state(run) -> None:
     np.testing.assert_allclose(first.states, first.observations[:, :, 0], rtol=1e-6)
     stream.step()
     assert stream.step().states.any() and not stream.step().states.any()
+
+
+def test_a_state_that_fails_at_the_end_is_not_sent(run) -> None:
+    class Late(Line):
+        bad: object = ValueError
+
+        def state(self) -> np.ndarray:
+            if self.agents:
+                return np.zeros(3)
+            if isinstance(self.bad, int):
+                return np.zeros(self.bad)
+            raise ValueError("nobody there")
+
+    for Late.bad in (ValueError, 2):
+        assert run(Late).description.state_width == 0
+    Late.bad = 3
+    stream = run(lambda: Late(limit=1))
+    assert stream.description.state_width == 3
+    assert run(Late, state=False).description.state_width == 0
+    for Late.bad, said in ((ValueError, "state(): ValueError: nobody there ("), (2, "state(): expected 3 numbers")):
+        stream.reset(1)
+        problem = stream.step()
+        assert said in problem.message and problem.message.endswith("serve with state=False if it is of no use")

@@ -145,6 +145,7 @@ def test_continuous_actions(run) -> None:
         ([spaces.MultiDiscrete([[2, 2]])] * 2, "MultiDiscrete of shape (1, 2); give it one axis"),
         ([spaces.Box(0, 5, (1,), np.int32)] * 2, "Box of int32; use MultiDiscrete for whole numbers"),
         ([spaces.Box(0, np.inf, (2,))] * 2, "number 0 has one bound, 0.0 to inf; give both or none"),
+        ([spaces.Box(np.zeros(2), np.array([1.0, 0.0]), dtype=np.float64)] * 2, "number 1 lies between 0.0 and 0.0; leave it out"),
         ([spaces.Tuple((spaces.Discrete(2),))] * 2, "Tuple is not supported; use Discrete, MultiDiscrete, MultiBinary or Box"),
         (
             [spaces.Discrete(2), spaces.Box(-1, 1, (1,))],
