@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hmac
+import io
 import ipaddress
 import os
 import signal
@@ -105,6 +106,9 @@ def _serve_actor(service: Service, socket: str) -> None:
     if threading.current_thread() is threading.main_thread():
         # Ctrl-C reaches the whole terminal. The actor finishes its work first, and needs its environment for that.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The actor logs what the environment prints; in a pipe Python would hold it back.
+        sys.stdout.reconfigure(line_buffering=True)
     threading.Thread(target=_end_with_input, daemon=True, name="magex-parent").start()
     # A server without a reference to it is collected, and its socket removed.
     server, _ = start(service, f"unix:{socket}")

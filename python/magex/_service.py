@@ -71,6 +71,8 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
             text = str(error) if isinstance(error, (Refused, Problem)) else f"make: {describe(error)}"
             context.abort(grpc.StatusCode.FAILED_PRECONDITION, text)
             return
+        # Some clients wait for the head of the answer before they send a request.
+        context.send_initial_metadata(())
         try:
             for message in requests:
                 yield stream.answer(message)

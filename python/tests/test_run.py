@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import grpc
 import numpy as np
@@ -429,3 +430,20 @@ def test_a_state_that_fails_at_the_end_is_not_sent(run) -> None:
         stream.reset(1)
         problem = stream.step()
         assert said in problem.message and problem.message.endswith("serve with state=False if it is of no use")
+
+
+def test_a_slow_environment_plays_less_before_it_describes_itself(run, monkeypatch) -> None:
+    steps = 0
+
+    class Slow(Line):
+        def step(self, actions: dict) -> tuple:
+            nonlocal steps
+            steps += 1
+            time.sleep(0.01)
+            return super().step(actions)
+
+    monkeypatch.setattr("magex._probe.SECONDS", 0.2)
+    for worlds in (None, 1):
+        steps = 0
+        assert run(Slow, worlds=worlds).description.deterministic
+        assert 4 < steps < 60
