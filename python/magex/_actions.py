@@ -145,7 +145,7 @@ class ActionTable:
     def rows(self, actions: np.ndarray, acts: np.ndarray) -> Any:
         """actions [W, N, H or C] as something whose [w][i] is what agent i of world w takes."""
         if self.discrete:
-            # Choices that nobody checked are those of agents that do not act.
+            # Choices that passed unchecked are those of agents that do not act.
             whole = np.minimum(actions, self.own - 1) + self.start
             if self.single:
                 return whole[:, :, 0].tolist()

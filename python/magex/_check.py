@@ -262,26 +262,26 @@ class _Player:
         for agent in agents:
             i = self.index[agent]
             codec, value = layout.observations[i], observations[agent]
-            who = f'{where}, agent "{agent}"'
+            place = f'{where}, agent "{agent}"'
             row = np.zeros(codec.width, np.float64)
             try:
                 codec.write(codec.numbers(value), row)
             except Unfit as unfit:
-                report.add("observations", f"{who}: {unfit}")
+                report.add("observations", f"{place}: {unfit}")
                 continue
             trace.append(row.tobytes())
             finite = bool(np.isfinite(row).all())
             if not finite:
                 at = int(np.argmin(np.isfinite(row)))
-                report.add("finite", f"{who}: observation has {row[at]} as number {at}")
-            right = _dtypes(report, who, codec.inner, codec.numbers(value), "observation")
+                report.add("finite", f"{place}: observation has {row[at]} as number {at}")
+            right = _dtypes(report, place, codec.inner, codec.numbers(value), "observation")
             if finite and right and not _contains(codec.inner, codec.numbers(value)):
-                report.add("observations", f"{who}: observation is not in its space: {_outside(codec.inner, codec.numbers(value))}")
+                report.add("observations", f"{place}: observation is not in its space: {_outside(codec.inner, codec.numbers(value))}")
             self.returned.append((where, agent, value, copy.deepcopy(value)))
             if self.masks is not None and layout.own_masks:
-                self._mask(who, i, value, infos.get(agent), agent in acting)
+                self._mask(place, i, value, infos.get(agent), agent in acting)
 
-    def _mask(self, who: str, i: int, value: Any, info: Any, acts: bool) -> None:
+    def _mask(self, place: str, i: int, value: Any, info: Any, acts: bool) -> None:
         codec = self.layout.observations[i]
         assert self.masks is not None
         mask = None
@@ -294,30 +294,30 @@ class _Player:
         if not acts:
             return
         if mask is None:
-            self.report.add("masks", f"{who}: no action_mask, and there was one after the first reset; give it in every step")
+            self.report.add("masks", f"{place}: no action_mask, and there was one after the first reset; give it in every step")
             self.masks[i] = self.layout.actions.allowed[i]
             return
         try:
             self.layout.actions.codecs[i].mask(mask, self.masks[i])
         except Unfit as unfit:
-            self.report.add("masks", f"{who}: {unfit}")
+            self.report.add("masks", f"{place}: {unfit}")
             self.masks[i] = self.layout.actions.allowed[i]
             return
         if not self.masks[i].any(axis=1).all():
-            self.report.add("masks", f"{who}: action_mask allows no choice; allow one at least in every component")
+            self.report.add("masks", f"{place}: action_mask allows no choice; allow one at least in every component")
             self.masks[i] = self.layout.actions.allowed[i]
 
     def _reward(self, where: str, agent: str, reward: Any, trace: list[bytes]) -> None:
-        who = f'{where}, agent "{agent}"'
+        place = f'{where}, agent "{agent}"'
         if isinstance(reward, np.ndarray) and reward.size == 1 and reward.dtype.kind in "biuf":
-            self.report.add("rewards", f"{who}: reward is an array of shape {reward.shape}; give float(reward)", warning=True)
+            self.report.add("rewards", f"{place}: reward is an array of shape {reward.shape}; give float(reward)", warning=True)
             reward = reward.reshape(-1)[0]
         number = isinstance(reward, (int, float, np.integer, np.floating)) and not isinstance(reward, bool)
         if not number and not isinstance(reward, (bool, np.bool_)):
-            self.report.add("rewards", f"{who}: reward is {short(reward)}; give a number")
+            self.report.add("rewards", f"{place}: reward is {short(reward)}; give a number")
             return
         if not np.isfinite(reward):
-            self.report.add("finite", f"{who}: reward is {float(reward)}")
+            self.report.add("finite", f"{place}: reward is {float(reward)}")
         trace.append(np.float64(reward).tobytes())
 
     def _aliasing(self, where: str) -> None:
@@ -439,19 +439,19 @@ def _outside(space: Any, value: Any) -> str:
     return f"{short(value)}, and the space is {short(space)}"
 
 
-def _dtypes(report: Report, who: str, space: Any, value: Any, field: str) -> bool:
+def _dtypes(report: Report, place: str, space: Any, value: Any, field: str) -> bool:
     """Whether all arrays have the dtype of their space."""
     name = kind(space)
     if name in ("Box", "MultiBinary", "MultiDiscrete"):
         if not isinstance(value, np.ndarray):
-            report.add("dtypes", f"{who}: {field} is a {type(value).__name__}; return a NumPy array of {space.dtype}")
+            report.add("dtypes", f"{place}: {field} is a {type(value).__name__}; return a NumPy array of {space.dtype}")
             return False
         if value.dtype != space.dtype:
-            report.add("dtypes", f"{who}: {field} has dtype {value.dtype}, and its space {space.dtype}")
+            report.add("dtypes", f"{place}: {field} has dtype {value.dtype}, and its space {space.dtype}")
             return False
         return True
     parts = space.spaces.items() if name == "Dict" else enumerate(space.spaces) if name == "Tuple" else ()
-    return all([_dtypes(report, who, part, value[key], f"{field}[{key!r}]") for key, part in parts])
+    return all([_dtypes(report, place, part, value[key], f"{field}[{key!r}]") for key, part in parts])
 
 
 def _equal(a: Any, b: Any) -> bool:

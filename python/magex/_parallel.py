@@ -65,7 +65,7 @@ class Alone:
 
 
 class _World:
-    """One environment object and who acts in it."""
+    """One environment object and the agents that act in it."""
 
     __slots__ = ("env", "alive", "ghosts", "spoiled", "said")
 
@@ -75,7 +75,7 @@ class _World:
         self.alive: tuple[int, ...] = ()
         # Agents that ended and that the environment still lists.
         self.ghosts: set[int] = set()
-        # It raised: nobody knows in which state it is, and it is made anew.
+        # It raised: its state is not known, and it is made anew.
         self.spoiled = False
         # What infos said of success, so far in this episode.
         self.said: list[bool] = []
@@ -271,7 +271,7 @@ class ParallelWorlds:
             self._info_masks(w, infos, batch)
 
     def _after(self, w: int, ended: np.ndarray, infos: Any, batch: Batch, observations: Any = None) -> None:
-        """Who acts next in a world in which somebody ended, left or came."""
+        """Which agents act next in a world in which one ended, left or came."""
         world = self.worlds[w]
         before = world.alive
         live = set(self._alive(w, world.env))
@@ -345,7 +345,7 @@ class ParallelWorlds:
             _fill(out, where, fast, self.agents, values, lambda w, agent, value, name=name: _flag(w, agent, name, value))
 
     def _finish(self, batch: Batch) -> Batch:
-        """What holds for all: states, who acts next, zeros for who does not, finite numbers."""
+        """What holds for all worlds: states, the agents that act next, zeros for the others, finite numbers."""
         for w, world in enumerate(self.worlds):
             batch.active[w, world.alive if world.alive is not self.all else slice(None)] = True
         ended = batch.terminated | batch.truncated

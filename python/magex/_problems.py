@@ -39,14 +39,14 @@ def request(message: str) -> Problem:
 
 def broke(world: int, agent: str | None, field: str, expected: object, seen: object) -> Problem:
     """The environment's fault: it returned what its description does not allow."""
-    who = f'world {world}, agent "{agent}"' if agent is not None else f"world {world}"
-    return Problem(BROKE_ITS_WORD, f"{who}, {field}: expected {expected}, seen {seen}", world)
+    place = f'world {world}, agent "{agent}"' if agent is not None else f"world {world}"
+    return Problem(BROKE_ITS_WORD, f"{place}, {field}: expected {expected}, seen {seen}", world)
 
 
 def raised(error: BaseException, during: str, world: int | None = None) -> Problem:
     """The environment's fault: it raised an exception."""
-    who = f"world {world}, {during}" if world is not None else during
-    return Problem(RAISED, f"{who}: {describe(error)}", world)
+    place = f"world {world}, {during}" if world is not None else during
+    return Problem(RAISED, f"{place}: {describe(error)}", world)
 
 
 def describe(error: BaseException) -> str:
@@ -54,8 +54,8 @@ def describe(error: BaseException) -> str:
     text = " ".join(str(error).split())
     if len(text) > 500:
         text = text[:500] + "…"
-    place = frame(error)
-    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
+    line = frame(error)
+    return f"{type(error).__name__}: {text}" + (f" ({line})" if line else "")
 
 
 def frame(error: BaseException) -> str:

@@ -18,7 +18,7 @@ RULES = {
     "dtypes": "every observation is an array with the dtype of its space",
     "finite": "observations and rewards have neither NaN nor infinities",
     "rewards": "rewards are single numbers",
-    "ends": "terminations and truncations are True or False; who ends leaves `agents`, and nobody leaves otherwise",
+    "ends": "terminations and truncations are True or False; an agent that ends leaves `agents`, and no agent leaves otherwise",
     "after the end": "`agents` stays empty until the next reset",
     "limits": "an episode ends at its limit of steps, as truncation",
     "masks": "action masks have the shape of the actions and allow one choice at least",

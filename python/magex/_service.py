@@ -116,7 +116,7 @@ class Stream:
                 problem=pb.EnvironmentProblem(kind=problem.kind, message=problem.message, world=problem.world)
             )
         except Exception as error:
-            # Nothing of the environment's ends the stream, not even what nobody thought of.
+            # Nothing of the environment's ends the stream, not even what is handled nowhere else.
             return pb.EnvironmentReply(
                 problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error))
             )

@@ -21,7 +21,7 @@ class VectorEnvironment:
     * `step(actions)`: actions is [W, N] (Discrete), [W, N, H] (MultiDiscrete, MultiBinary) or [W, N, *shape] (Box).
       Returns observations [W, N, ...], rewards [W, N], terminated [W, N] and truncated [W, N];
       the last three may be [W] if they are the same for all agents.
-      Worlds and agents that are over are stepped too, with actions of zeros: nobody looks at what they give.
+      Worlds and agents that are over are stepped too, with actions of zeros: what they give is ignored.
     * `restart(which, seeds)`: begins a new episode in the K worlds `which`, int64 [K], seeds uint32 [K].
       Returns the observations of these, [K, N, ...]. Other worlds must not change.
 

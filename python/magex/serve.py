@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tls-certificate", metavar="FILE")
     parser.add_argument("--tls-key", metavar="FILE")
     parser.add_argument("--token-file", metavar="FILE", help="[default: the environment variable MAGEX_TOKEN]")
-    parser.add_argument("--insecure", action="store_true", help="answer everyone who can reach the address")
+    parser.add_argument("--insecure", action="store_true", help="answer every client that can reach the address")
     options = parser.parse_args(arguments)
     try:
         make = load(options.environment)

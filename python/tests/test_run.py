@@ -90,12 +90,12 @@ class Lists(Line):
     """Forgets to remove an agent that ended, and goes on telling what it sees."""
 
     def step(self, actions: dict) -> tuple:
-        everybody = self.possible_agents[:]
-        actions = {agent: actions.get(agent, 1) for agent in everybody}
-        self.agents = everybody
+        everyone = self.possible_agents[:]
+        actions = {agent: actions.get(agent, 1) for agent in everyone}
+        self.agents = everyone
         result = super().step(actions)
         over = not self.agents
-        self.agents = [] if over else everybody
+        self.agents = [] if over else everyone
         return result
 
 
@@ -246,7 +246,7 @@ def test_a_missing_reward_is_named(run) -> None:
     )
 
 
-def test_who_leaves_without_an_end_is_named(run) -> None:
+def test_an_agent_that_leaves_without_an_end_is_named(run) -> None:
     class Vanishes(Line):
         far = 50.0
 
@@ -418,7 +418,7 @@ def test_a_state_that_fails_at_the_end_is_not_sent(run) -> None:
                 return np.zeros(3)
             if isinstance(self.bad, int):
                 return np.zeros(self.bad)
-            raise ValueError("nobody there")
+            raise ValueError("no agents")
 
     for Late.bad in (ValueError, 2):
         assert run(Late).description.state_width == 0
@@ -426,7 +426,7 @@ def test_a_state_that_fails_at_the_end_is_not_sent(run) -> None:
     stream = run(lambda: Late(limit=1))
     assert stream.description.state_width == 3
     assert run(Late, state=False).description.state_width == 0
-    for Late.bad, said in ((ValueError, "state(): ValueError: nobody there ("), (2, "state(): expected 3 numbers")):
+    for Late.bad, said in ((ValueError, "state(): ValueError: no agents ("), (2, "state(): expected 3 numbers")):
         stream.reset(1)
         problem = stream.step()
         assert said in problem.message and problem.message.endswith("serve with state=False if it is of no use")

@@ -85,7 +85,7 @@ def test_prints_one_line_with_its_address() -> None:
     line = process.stdout.readline()
     assert line.startswith("http://127.0.0.1:") and not line.startswith("http://127.0.0.1:0\n")
     assert describe(line.strip().removeprefix("http://")).name == "line"
-    # Its input is nobody's here.
+    # Its input means nothing here.
     process.stdin.close()
     time.sleep(0.3)
     assert process.poll() is None
@@ -114,7 +114,7 @@ def test_two_on_one_port() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["environments:Nobody"], "magex: environment: environments has no Nobody; give the name of a function or class in it"),
+        (["environments:Absent"], "magex: environment: environments has no Absent; give the name of a function or class in it"),
         (["environments"], "magex: environment: environments is not module:callable"),
         (["absent_module:x"], "magex: environment: cannot import absent_module: ModuleNotFoundError"),
         (
