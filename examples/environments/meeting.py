@@ -38,8 +38,8 @@ class Meeting(ParallelEnv):
         apart = np.ptp(self.cells, axis=0).sum() / (SIDE - 1)
         met, late = bool(apart == 0), self.steps == STEPS
         self.agents = [] if met or late else agents
-        each = lambda value: {agent: value for agent in agents}
-        return self.observe(), each(-float(apart)), each(met), each(late and not met), each({"is_success": met})
+        rewards, infos = dict.fromkeys(agents, -float(apart)), {agent: {"is_success": met} for agent in agents}
+        return self.observe(), rewards, dict.fromkeys(agents, met), dict.fromkeys(agents, late and not met), infos
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ class Navigation(magex.VectorEnvironment):
         for world in which:
             self.env.reset_at(int(world))
         self.steps[which] = 0
-        return self.stack(self.env.get_from_scenario(get_observations=True, get_rewards=False, get_infos=False, get_dones=False)[0])[which]
+        return self.stack([self.env.scenario.observation(agent) for agent in self.env.agents])[which]
 
     def step(self, actions):
         self.steps += 1

@@ -62,7 +62,9 @@ class ActionCodec:
         empty = self.low >= self.high
         if empty.any():
             at = int(np.argmax(empty))
-            raise Refused(f"{field}: number {at} lies between {self.low[at]} and {self.high[at]}; leave it out, or widen its bounds")
+            raise Refused(
+                f"{field}: number {at} lies between {self.low[at]} and {self.high[at]}; leave it out, or widen its bounds"
+            )
         self.size = len(self.low)
         if self.size == 0:
             raise Refused(f"{field}: has no numbers; give it one at least")

@@ -7,6 +7,7 @@ into lists and become arrays once. A world in which an agent has left, or that r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from magex._layout import Batch, Layout
 from magex._observations import Unfit
-from magex._problems import Problem, StateProblem, broke, names, raised, request, short
+from magex._problems import Problem, StateProblem, broke, names, raised, short
 
 
 class Alone:
@@ -253,7 +254,10 @@ class ParallelWorlds:
             raise broke(w, None, "step", expected, f"{len(result)} values" if isinstance(result, tuple) else short(result))
         observations, rewards, terminations, truncations, infos = result
         parts = (
-            (observations, "observations"), (rewards, "rewards"), (terminations, "terminations"), (truncations, "truncations"),
+            (observations, "observations"),
+            (rewards, "rewards"),
+            (terminations, "terminations"),
+            (truncations, "truncations"),
         )
         for values, field in parts:
             self._known(w, values, field)
@@ -264,8 +268,8 @@ class ParallelWorlds:
                     raise broke(w, agent, field, "a value for every agent that acted", f"values of {names(values)}")
             self._observe(w, i, observations, batch)
             batch.rewards[w, i] = _number(w, agent, rewards[agent])
-            batch.terminated[w, i] = _flag(w, agent, "terminations", terminations[agent])
-            batch.truncated[w, i] = _flag(w, agent, "truncations", truncations[agent])
+            batch.terminated[w, i] = _flag(w, agent, terminations[agent], "terminations")
+            batch.truncated[w, i] = _flag(w, agent, truncations[agent], "truncations")
         self._after(w, batch.terminated[w] | batch.truncated[w], infos, batch, observations)
         if self.layout.own_masks:
             self._info_masks(w, infos, batch)
@@ -281,9 +285,7 @@ class ParallelWorlds:
                 if said is not None:
                     world.said.append(said)
             elif i not in live:
-                raise broke(
-                    w, self.agents[i], "agents", "the agent, or its end in terminations or truncations", "neither"
-                )
+                raise broke(w, self.agents[i], "agents", "the agent, or its end in terminations or truncations", "neither")
         # An agent that ended and is still listed has ended all the same; one that was not listed before has come.
         came = live.difference(before, world.ghosts)
         world.ghosts = {i for i in live if i in world.ghosts or ended[i]}
@@ -339,10 +341,8 @@ class ParallelWorlds:
                 for i in self.all:
                     self._observe(w, i, values, batch)
         _fill(batch.rewards, where, fast, self.agents, rewards, _number)
-        for name, out, values in (
-            ("terminations", batch.terminated, terminated), ("truncations", batch.truncated, truncated)
-        ):
-            _fill(out, where, fast, self.agents, values, lambda w, agent, value, name=name: _flag(w, agent, name, value))
+        _fill(batch.terminated, where, fast, self.agents, terminated, partial(_flag, field="terminations"))
+        _fill(batch.truncated, where, fast, self.agents, truncated, partial(_flag, field="truncations"))
 
     def _finish(self, batch: Batch) -> Batch:
         """What holds for all worlds: states, the agents that act next, zeros for the others, finite numbers."""
@@ -370,7 +370,7 @@ def finite(batch: Batch, layout: Layout) -> None:
     if batch.masks is not None:
         batch.masks &= batch.active[:, :, None, None]
         if layout.own_masks:
-            nothing = ~batch.masks.any(axis=3).all(axis=2) & batch.active
+            nothing = batch.active & ~np.all(batch.masks.any(axis=3), axis=2)
             if nothing.any():
                 w, i = (int(x) for x in np.argwhere(nothing)[0])
                 raise broke(w, layout.agents[i], "action_mask", "one allowed choice at least in every component", "none")
@@ -380,7 +380,9 @@ def _fill(out: np.ndarray, where: Any, fast: list[int], agents: Sequence[str], v
     try:
         array = np.array(values)
         # Anything but plain numbers or flags is looked at one by one.
-        plain = array.shape == (len(fast), len(agents)) and (array.dtype.kind == "b" or array.dtype.kind in "iuf" and out.dtype != np.bool_)
+        plain = array.shape == (len(fast), len(agents)) and (
+            array.dtype.kind == "b" or array.dtype.kind in "iuf" and out.dtype != np.bool_
+        )
     except ValueError:
         plain = False
     if plain:
@@ -402,7 +404,7 @@ def _number(w: int, agent: str, value: Any) -> float:
     raise broke(w, agent, "reward", "a number", short(value))
 
 
-def _flag(w: int, agent: str, field: str, value: Any) -> bool:
+def _flag(w: int, agent: str, value: Any, field: str) -> bool:
     array = np.asarray(value)
     if array.size == 1 and array.dtype.kind in "biu" and int(array.reshape(-1)[0]) in (0, 1):
         return bool(array.reshape(-1)[0])

@@ -117,8 +117,11 @@ def _typed(layout: Layout, actions: np.ndarray) -> np.ndarray:
 
 def _record(layout: Layout, batch: Batch, w: int) -> dict[str, Any]:
     fields = {
-        "observations": batch.observations[w], "rewards": batch.rewards[w], "terminated": batch.terminated[w],
-        "truncated": batch.truncated[w], "active": batch.active[w],
+        "observations": batch.observations[w],
+        "rewards": batch.rewards[w],
+        "terminated": batch.terminated[w],
+        "truncated": batch.truncated[w],
+        "active": batch.active[w],
     }
     if batch.masks is not None:
         fields["masks"] = batch.masks[w]

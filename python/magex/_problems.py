@@ -8,7 +8,10 @@ import traceback
 
 import numpy as np
 
-RAISED, BROKE_ITS_WORD, REQUEST = 1, 2, 3
+from magex._wire.environment_pb2 import EnvironmentProblem
+
+Kind = EnvironmentProblem.Kind
+RAISED, BROKE_ITS_WORD, REQUEST = EnvironmentProblem.RAISED, EnvironmentProblem.BROKE_ITS_WORD, EnvironmentProblem.REQUEST
 
 _HERE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "purelib", "platlib")})
@@ -21,7 +24,7 @@ class Refused(Exception):
 class Problem(Exception):
     """One request failed. The stream stays usable."""
 
-    def __init__(self, kind: int, message: str, world: int | None = None) -> None:
+    def __init__(self, kind: Kind, message: str, world: int | None = None) -> None:
         super().__init__(message)
         self.kind = kind
         self.message = message

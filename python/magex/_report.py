@@ -11,7 +11,7 @@ RULES = {
     "make": "the callable returns environments that can be served, again and again, also after close()",
     "spaces": "observation_space(agent) and action_space(agent) return the same object on each call",
     "agents": "possible_agents is a list of different strings, agents a list of its own with names out of it",
-    "reset": "reset(seed=) returns (observations, infos) for exactly the agents in `agents`; reset() without a seed works afterwards",
+    "reset": "reset(seed=) returns (observations, infos) for exactly the agents in `agents`; reset() alone works afterwards",
     "step": "step(actions) takes every allowed action and returns five dicts",
     "keys": "observations, rewards, terminations, truncations and infos have exactly the agents that acted as keys",
     "observations": "every observation lies in its space",

@@ -76,7 +76,9 @@ def serve(
         raise SystemExit(1) from None
 
 
-def start(service: Service, address: str, credentials: grpc.ServerCredentials | None = None, token: str | None = None) -> tuple[grpc.Server, int]:
+def start(
+    service: Service, address: str, credentials: grpc.ServerCredentials | None = None, token: str | None = None
+) -> tuple[grpc.Server, int]:
     """Listens; returns the server and its port."""
     server = grpc.server(
         futures.ThreadPoolExecutor(max_workers=STREAMS_MAX, thread_name_prefix="magex"),
@@ -210,12 +212,10 @@ class _Token(grpc.ServerInterceptor):
         self.expected = f"Bearer {token}".encode()
 
         def refuse(_: Any, context: grpc.ServicerContext) -> None:
-            context.abort(
-                grpc.StatusCode.UNAUTHENTICATED, "authorization: missing or wrong; send 'authorization: Bearer TOKEN'"
-            )
+            context.abort(grpc.StatusCode.UNAUTHENTICATED, "authorization: missing or wrong; send 'authorization: Bearer TOKEN'")
 
-        self.unary = grpc.unary_unary_rpc_method_handler(refuse)
-        self.stream = grpc.stream_stream_rpc_method_handler(refuse)
+        self.unary: Any = grpc.unary_unary_rpc_method_handler(refuse)
+        self.stream: Any = grpc.stream_stream_rpc_method_handler(refuse)
 
     def intercept_service(self, continuation: Callable[..., Any], details: Any) -> Any:
         given = dict(details.invocation_metadata).get("authorization", "")

@@ -27,9 +27,7 @@ _TYPES = {np.dtype(np.float32): types_pb2.DATA_TYPE_F32, np.dtype(np.float64): t
 class Service(environment_pb2_grpc.EnvironmentServiceServicer):
     """Every stream has worlds of its own; Describe is computed once."""
 
-    def __init__(
-        self, environment: Environment, deterministic: bool | None = None, successes: bool | None = None
-    ) -> None:
+    def __init__(self, environment: Environment, deterministic: bool | None = None, successes: bool | None = None) -> None:
         self.environment = environment
         self.deterministic = deterministic
         self.successes = successes
@@ -117,9 +115,7 @@ class Stream:
             )
         except Exception as error:
             # Nothing of the environment's ends the stream, not even what is handled nowhere else.
-            return pb.EnvironmentReply(
-                problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error))
-            )
+            return pb.EnvironmentReply(problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error)))
 
     def _reset(self, message: pb.EnvironmentReset) -> Batch:
         seeds = list(message.seeds)

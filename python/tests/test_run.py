@@ -140,9 +140,7 @@ def test_options_reach_every_reset(run) -> None:
     assert not (stream.reset(1, 2).observations[:, :, 0] == 7).any()
 
 
-@pytest.mark.parametrize(
-    ("options", "said"), [("[1]", "options: a JSON list; send an object"), ("{", "options: no JSON")]
-)
+@pytest.mark.parametrize(("options", "said"), [("[1]", "options: a JSON list; send an object"), ("{", "options: no JSON")])
 def test_options_are_an_object(run, options: str, said: str) -> None:
     problem = run(Line).reset(1, options=options)
     assert problem.kind == pb.EnvironmentProblem.REQUEST and said in problem.message
@@ -198,10 +196,18 @@ class Breaks(Line):
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
-        (0, {"agent_1": np.array([1, np.nan], np.float32)}, 'world 0, agent "agent_1", observation number 1: expected a finite number, seen nan'),
+        (
+            0,
+            {"agent_1": np.array([1, np.nan], np.float32)},
+            'world 0, agent "agent_1", observation number 1: expected a finite number, seen nan',
+        ),
         (0, {"agent_1": np.zeros(3, np.float32)}, 'agent "agent_1", observation: expected shape (2,), seen shape (3,)'),
         (0, {"agent_1": "high"}, 'agent "agent_1", observation: expected shape (2,), seen shape ()'),
-        (0, {"__all__": 0}, 'observations: expected agents of possible_agents ("agent_0", "agent_1", "agent_2") as keys, seen "__all__"'),
+        (
+            0,
+            {"__all__": 0},
+            'observations: expected agents of possible_agents ("agent_0", "agent_1", "agent_2") as keys, seen "__all__"',
+        ),
         (0, None, "observations: expected a dict with the agents as keys, seen None"),
         (1, {"agent_2": math.inf}, 'agent "agent_2", reward: expected a finite number, seen inf'),
         (1, {"agent_2": None}, 'agent "agent_2", reward: expected a number, seen None'),

@@ -67,9 +67,7 @@ def test_ends_with_its_input_in_a_step_that_hangs(tmp_path: Path) -> None:
         "        print('hangs', flush=True)\n"
         "        while True: time.sleep(1)\n"
     )
-    process = launch(
-        "-m", "magex.serve", "hangs:Hangs", socket=tmp_path / "s", PYTHONPATH=f"{HERE.parent}:{HERE}:{tmp_path}"
-    )
+    process = launch("-m", "magex.serve", "hangs:Hangs", socket=tmp_path / "s", PYTHONPATH=f"{HERE.parent}:{HERE}:{tmp_path}")
     with grpc.insecure_channel(f"unix:{tmp_path}/s") as channel:
         call = environment_pb2_grpc.EnvironmentServiceStub(channel).Describe.future(
             pb.DescribeRequest(protocol=1), wait_for_ready=True
@@ -150,8 +148,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     now = datetime.datetime.now(datetime.timezone.utc)
     certificate = (
         x509.CertificateBuilder()
-        .subject_name(name).issuer_name(name).public_key(key.public_key()).serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(now + datetime.timedelta(days=1))
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
         .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False)
         .sign(key, hashes.SHA256())
     )
@@ -166,8 +168,16 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_a_token_and_a_certificate(files: tuple[Path, Path]) -> None:
     certificate, key = files
     process = launch(
-        "-m", "magex.serve", "environments:Line", "--address", "0.0.0.0:0",
-        "--tls-certificate", str(certificate), "--tls-key", str(key), MAGEX_TOKEN="s3cret",
+        "-m",
+        "magex.serve",
+        "environments:Line",
+        "--address",
+        "0.0.0.0:0",
+        "--tls-certificate",
+        str(certificate),
+        "--tls-key",
+        str(key),
+        MAGEX_TOKEN="s3cret",
     )
     line = process.stdout.readline()
     assert line.startswith("https://0.0.0.0:")

@@ -43,7 +43,11 @@ def test_the_order_is_that_of_gymnasium(space: spaces.Space) -> None:
         (spaces.Discrete(3, start=2), 5, "observation: expected an integer from 2 to 4, seen 5"),
         (spaces.Discrete(3), 1.5, "observation: expected an integer from 0 to 2, seen 1.5"),
         (spaces.Discrete(3), None, "observation: expected an integer from 0 to 2, seen None"),
-        (spaces.MultiDiscrete([2, 2]), np.array([0, 2]), "observation: expected an array of integers of shape (2,), from [0, 0] and below [2, 2]"),
+        (
+            spaces.MultiDiscrete([2, 2]),
+            np.array([0, 2]),
+            "observation: expected an array of integers of shape (2,), from [0, 0] and below [2, 2]",
+        ),
         (spaces.Dict(a=BOX), {"b": 1}, "observation['a']: expected a dict with this part, seen {'b': 1}"),
         (spaces.Tuple((BOX,)), (), "observation[0]: expected a tuple with this part, seen ()"),
     ],
@@ -145,7 +149,10 @@ def test_continuous_actions(run) -> None:
         ([spaces.MultiDiscrete([[2, 2]])] * 2, "MultiDiscrete of shape (1, 2); give it one axis"),
         ([spaces.Box(0, 5, (1,), np.int32)] * 2, "Box of int32; use MultiDiscrete for whole numbers"),
         ([spaces.Box(0, np.inf, (2,))] * 2, "number 0 has one bound, 0.0 to inf; give both or none"),
-        ([spaces.Box(np.zeros(2), np.array([1.0, 0.0]), dtype=np.float64)] * 2, "number 1 lies between 0.0 and 0.0; leave it out"),
+        (
+            [spaces.Box(np.zeros(2), np.array([1.0, 0.0]), dtype=np.float64)] * 2,
+            "number 1 lies between 0.0 and 0.0; leave it out",
+        ),
         ([spaces.Tuple((spaces.Discrete(2),))] * 2, "Tuple is not supported; use Discrete, MultiDiscrete, MultiBinary or Box"),
         (
             [spaces.Discrete(2), spaces.Box(-1, 1, (1,))],
@@ -153,7 +160,7 @@ def test_continuous_actions(run) -> None:
         ),
         (
             [spaces.Discrete(2), spaces.Discrete(3)],
-            'action_space: agent "agent_0" has Discrete(2) and agent "agent_1" Discrete(3); make them equal, or serve with pad=True',
+            'action_space: agent "agent_0" has Discrete(2) and agent "agent_1" Discrete(3); make them equal, or',
         ),
         (
             [spaces.Box(-1, 1, (1,)), spaces.Box(-2, 2, (1,))],

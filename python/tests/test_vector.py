@@ -33,9 +33,7 @@ def test_steps_and_restarts(run) -> None:
     first = stream.reset(1, 2, 3)
     assert first.observations.shape == (3, 2, 2) and first.active == [[1, 1]] * 3
     second = stream.step(np.array([[[2], [1]], [[0], [0]], [[1], [1]]]))
-    np.testing.assert_allclose(
-        second.observations[:, :, 0] - first.observations[:, :, 0], [[1, 0], [-1, -1], [0, 0]], atol=1e-6
-    )
+    np.testing.assert_allclose(second.observations[:, :, 0] - first.observations[:, :, 0], [[1, 0], [-1, -1], [0, 0]], atol=1e-6)
     np.testing.assert_allclose(second.states, second.observations[:, :, 0], atol=1e-6)
     mixed = stream.step(2, restarts={1: 3})
     np.testing.assert_array_equal(mixed.observations[1], first.observations[2])
@@ -99,10 +97,25 @@ class Broken(Many):
 @pytest.mark.parametrize(
     ("field", "value", "kind", "said"),
     [
-        (0, np.zeros((2, 2)), pb.EnvironmentProblem.BROKE_ITS_WORD, "observations of step: expected numbers of shape (1, 2, 2), seen float64 of shape (2, 2)"),
+        (
+            0,
+            np.zeros((2, 2)),
+            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            "observations of step: expected numbers of shape (1, 2, 2), seen float64 of shape (2, 2)",
+        ),
         (0, None, pb.EnvironmentProblem.BROKE_ITS_WORD, "seen object of shape ()"),
-        (0, np.full((1, 2, 2), np.nan), pb.EnvironmentProblem.BROKE_ITS_WORD, 'world 0, agent "left", observation number 0: expected a finite number, seen nan'),
-        (1, np.zeros((1, 3)), pb.EnvironmentProblem.BROKE_ITS_WORD, "rewards: expected numbers of shape (1, 2), seen float64 of shape (1, 3)"),
+        (
+            0,
+            np.full((1, 2, 2), np.nan),
+            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            'world 0, agent "left", observation number 0: expected a finite number, seen nan',
+        ),
+        (
+            1,
+            np.zeros((1, 3)),
+            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            "rewards: expected numbers of shape (1, 2), seen float64 of shape (1, 3)",
+        ),
         (2, np.full((1, 2), 0.5), pb.EnvironmentProblem.BROKE_ITS_WORD, "terminated: expected True or False, seen float64"),
         (5, None, pb.EnvironmentProblem.BROKE_ITS_WORD, "step: expected (observations, rewards, terminated, truncated)"),
         (9, None, pb.EnvironmentProblem.RAISED, "step: KeyError: 'wheel' ("),
@@ -196,7 +209,7 @@ def test_spaces_of_vectors(served) -> None:
         observation_space = None
 
     assert "a vector environment needs a Box" in refused(served(Parts))
-    assert "observation_space: agent \"left\" has" in refused(served(Sizes))
+    assert 'observation_space: agent "left" has' in refused(served(Sizes))
     assert "observation_space: missing" in refused(served(Without))
 
 
