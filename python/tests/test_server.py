@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 
 def launch(*arguments: str, socket: Path | None = None, **variables: str) -> subprocess.Popen:
-    env = {**os.environ, "PYTHONPATH": f"{HERE.parent}:{HERE}", **variables}
+    env = {**os.environ, "PYTHONPATH": f"{HERE}:{os.environ.get('PYTHONPATH', '')}", **variables}
     env.pop("MAGEX_ENVIRONMENT_SOCKET", None)
     env.pop("MAGEX_TOKEN", None)
     if socket:
@@ -67,7 +67,7 @@ def test_ends_with_its_input_in_a_step_that_hangs(tmp_path: Path) -> None:
         "        print('hangs', flush=True)\n"
         "        while True: time.sleep(1)\n"
     )
-    process = launch("-m", "magex.serve", "hangs:Hangs", socket=tmp_path / "s", PYTHONPATH=f"{HERE.parent}:{HERE}:{tmp_path}")
+    process = launch("-m", "magex.serve", "hangs:Hangs", socket=tmp_path / "s", PYTHONPATH=f"{HERE}:{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     with grpc.insecure_channel(f"unix:{tmp_path}/s") as channel:
         call = environment_pb2_grpc.EnvironmentServiceStub(channel).Describe.future(
             pb.DescribeRequest(protocol=1), wait_for_ready=True
