@@ -33,7 +33,11 @@ def measure(environment: str, worlds: int, seconds: float) -> None:
             [sys.executable, "-m", "magex.serve", environment],
             stdin=subprocess.PIPE,
             cwd=HERE,
-            env={**os.environ, "MAGEX_ENVIRONMENT_SOCKET": socket, "PYTHONPATH": f"{HERE.parent}:{os.environ.get('PYTHONPATH', '')}"},
+            env={
+                **os.environ,
+                "MAGEX_ENVIRONMENT_SOCKET": socket,
+                "PYTHONPATH": f"{HERE.parent}:{os.environ.get('PYTHONPATH', '')}",
+            },
         )
         try:
             with grpc.insecure_channel(f"unix:{socket}") as channel:

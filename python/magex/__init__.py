@@ -1,7 +1,7 @@
 """Serves a Python environment to MAGE-X, which trains teams of agents in it.
 
-    import magex
-    magex.serve(make)      # make() returns a PettingZoo Parallel environment, a Gymnasium environment or a VectorEnvironment
+import magex
+magex.serve(make)      # make() returns a PettingZoo Parallel environment, a Gymnasium environment or a VectorEnvironment
 """
 
 from magex._random import uniform

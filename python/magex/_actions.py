@@ -59,6 +59,12 @@ class ActionCodec:
         if one_sided.any():
             at = int(np.argmax(one_sided))
             raise Refused(f"{field}: number {at} has one bound, {self.low[at]} to {self.high[at]}; give both or none")
+        empty = self.low >= self.high
+        if empty.any():
+            at = int(np.argmax(empty))
+            raise Refused(
+                f"{field}: number {at} lies between {self.low[at]} and {self.high[at]}; leave it out, or widen its bounds"
+            )
         self.size = len(self.low)
         if self.size == 0:
             raise Refused(f"{field}: has no numbers; give it one at least")
@@ -141,7 +147,7 @@ class ActionTable:
     def rows(self, actions: np.ndarray, acts: np.ndarray) -> Any:
         """actions [W, N, H or C] as something whose [w][i] is what agent i of world w takes."""
         if self.discrete:
-            # Choices that nobody checked are those of agents that do not act.
+            # Choices that passed unchecked are those of agents that do not act.
             whole = np.minimum(actions, self.own - 1) + self.start
             if self.single:
                 return whole[:, :, 0].tolist()

@@ -13,10 +13,11 @@ import numpy as np
 from magex import _probe
 from magex._environment import Environment
 from magex._layout import Layout
-from magex._observations import Unfit, kind
+from magex._observations import Unfit
 from magex._parallel import Alone
 from magex._problems import Problem, Refused, describe, names, short
 from magex._report import Report
+from magex._values import contains, dtypes, equal, outside
 
 STEPS = 300
 
@@ -71,6 +72,7 @@ class _Player:
         self.layout = layout
         self.report = report
         self.index = {agent: i for i, agent in enumerate(layout.agents)}
+        self.state_width = layout.state_width
         self.lasted: list[tuple[int, bool, bool]] = []
         # The last observations, and what they were when they were returned.
         self.returned: list[tuple[str, str, Any, Any]] = []
@@ -127,7 +129,8 @@ class _Player:
                     )
         if list(env.possible_agents) != self.layout.agents:
             self.report.add(
-                "agents", f"possible_agents: {names(env.possible_agents)} in one object and {names(self.layout.agents)} in another"
+                "agents",
+                f"possible_agents: {names(env.possible_agents)} in one object and {names(self.layout.agents)} in another",
             )
 
     def _begin(self, env: Any, seed: int | None, where: str) -> tuple[dict, dict]:
@@ -171,9 +174,11 @@ class _Player:
         observations, infos = self._begin(env, seed, f"{name}, reset")
         trace: list[bytes] = []
         alive = list(env.agents)
-        self.masks = None if not self.layout.masks else np.broadcast_to(
-            self.layout.actions.allowed, self.layout.actions.allowed.shape
-        ).copy()
+        self.masks = (
+            None
+            if not self.layout.masks
+            else np.broadcast_to(self.layout.actions.allowed, self.layout.actions.allowed.shape).copy()
+        )
         self._observations(f"{name}, reset", observations, infos, alive, set(alive), trace)
         self._state(env, f"{name}, reset")
         for step in range(1, limit + 1):
@@ -192,7 +197,8 @@ class _Player:
     def _step(self, env: Any, where: str, alive: list[str], rng: np.random.Generator, trace: list[bytes]) -> list[str]:
         report, layout = self.report, self.layout
         numbers = _probe.random_actions(layout, rng, self.masks)[None]
-        rows = layout.actions.rows(numbers.astype(np.int64) if layout.actions.discrete else numbers, np.ones(numbers.shape[:2], bool))[0]
+        typed = numbers.astype(np.int64) if layout.actions.discrete else numbers
+        rows = layout.actions.rows(typed, np.ones(numbers.shape[:2], bool))[0]
         actions = {agent: rows[self.index[agent]] for agent in alive}
         kept = copy.deepcopy(actions)
         try:
@@ -203,16 +209,18 @@ class _Player:
         except Exception as error:
             report.add("step", f"{where}, actions {short(kept)}: {describe(error)}")
             raise _Over from None
-        if not _equal(kept, actions):
+        if not equal(kept, actions):
             report.add("actions", f"{where}: the actions were {short(kept)}, and are {short(actions)} after the step; copy them")
         if not isinstance(result, tuple) or len(result) != 5 or not all(isinstance(part, dict) for part in result):
             seen = f"{len(result)} values" if isinstance(result, tuple) and len(result) != 5 else short(result)
-            report.add("step", f"{where}: returns {seen}; return five dicts: observations, rewards, terminations, truncations, infos")
+            report.add(
+                "step", f"{where}: returns {seen}; return five dicts: observations, rewards, terminations, truncations, infos"
+            )
             raise _Over
         self._aliasing(where)
         observations, rewards, terminations, truncations, infos = result
         came = set(env.agents) - set(alive)
-        fields = {"observations": observations, "rewards": rewards, "terminations": terminations, "truncations": truncations, "infos": infos}
+        fields = dict(zip(("observations", "rewards", "terminations", "truncations", "infos"), result))
         missing = False
         for field, values in fields.items():
             unknown = values.keys() - set(alive) - came
@@ -221,7 +229,10 @@ class _Player:
             lacking = set(alive) - values.keys()
             if lacking:
                 missing = missing or field != "infos"
-                report.add("keys", f"{where}: {field} lacks {names(lacking)}, which acted; give its last one in the step in which it ends too")
+                report.add(
+                    "keys",
+                    f"{where}: {field} lacks {names(lacking)}, which acted; give its last one in the step in which it ends too",
+                )
         if missing:
             raise _Over
         ended = set()
@@ -248,7 +259,10 @@ class _Player:
             last = alive
             self.lasted.append((step, any(bool(truncations[a]) for a in last), any(bool(terminations[a]) for a in last)))
         elif self.layout.steps_max and int(where.rsplit(" ", 1)[1]) == self.layout.steps_max + 1:
-            report.add("limits", f"{where}: the episode goes on, and its limit is {self.layout.steps_max} steps; end it, or correct the limit")
+            report.add(
+                "limits",
+                f"{where}: the episode goes on, and its limit is {self.layout.steps_max} steps; end it, or correct the limit",
+            )
         return after
 
     # -- values
@@ -261,26 +275,28 @@ class _Player:
         for agent in agents:
             i = self.index[agent]
             codec, value = layout.observations[i], observations[agent]
-            who = f'{where}, agent "{agent}"'
+            place = f'{where}, agent "{agent}"'
             row = np.zeros(codec.width, np.float64)
             try:
                 codec.write(codec.numbers(value), row)
             except Unfit as unfit:
-                report.add("observations", f"{who}: {unfit}")
+                report.add("observations", f"{place}: {unfit}")
                 continue
             trace.append(row.tobytes())
             finite = bool(np.isfinite(row).all())
             if not finite:
                 at = int(np.argmin(np.isfinite(row)))
-                report.add("finite", f"{who}: observation has {row[at]} as number {at}")
-            _dtypes(report, who, codec.inner, codec.numbers(value), "observation")
-            if finite and not _contains(codec.inner, codec.numbers(value)):
-                report.add("observations", f"{who}: observation is not in its space: {_outside(codec.inner, codec.numbers(value))}")
+                report.add("finite", f"{place}: observation has {row[at]} as number {at}")
+            right = dtypes(report, place, codec.inner, codec.numbers(value), "observation")
+            if finite and right and not contains(codec.inner, codec.numbers(value)):
+                report.add(
+                    "observations", f"{place}: observation is not in its space: {outside(codec.inner, codec.numbers(value))}"
+                )
             self.returned.append((where, agent, value, copy.deepcopy(value)))
             if self.masks is not None and layout.own_masks:
-                self._mask(who, i, value, infos.get(agent), agent in acting)
+                self._mask(place, i, value, infos.get(agent), agent in acting)
 
-    def _mask(self, who: str, i: int, value: Any, info: Any, acts: bool) -> None:
+    def _mask(self, place: str, i: int, value: Any, info: Any, acts: bool) -> None:
         codec = self.layout.observations[i]
         assert self.masks is not None
         mask = None
@@ -293,42 +309,44 @@ class _Player:
         if not acts:
             return
         if mask is None:
-            self.report.add("masks", f"{who}: no action_mask, and there was one after the first reset; give it in every step")
+            self.report.add("masks", f"{place}: no action_mask, and there was one after the first reset; give it in every step")
             self.masks[i] = self.layout.actions.allowed[i]
             return
         try:
             self.layout.actions.codecs[i].mask(mask, self.masks[i])
         except Unfit as unfit:
-            self.report.add("masks", f"{who}: {unfit}")
+            self.report.add("masks", f"{place}: {unfit}")
             self.masks[i] = self.layout.actions.allowed[i]
             return
         if not self.masks[i].any(axis=1).all():
-            self.report.add("masks", f"{who}: action_mask allows no choice; allow one at least in every component")
+            self.report.add("masks", f"{place}: action_mask allows no choice; allow one at least in every component")
             self.masks[i] = self.layout.actions.allowed[i]
 
     def _reward(self, where: str, agent: str, reward: Any, trace: list[bytes]) -> None:
-        who = f'{where}, agent "{agent}"'
+        place = f'{where}, agent "{agent}"'
         if isinstance(reward, np.ndarray) and reward.size == 1 and reward.dtype.kind in "biuf":
-            self.report.add("rewards", f"{who}: reward is an array of shape {reward.shape}; give float(reward)", warning=True)
+            self.report.add("rewards", f"{place}: reward is an array of shape {reward.shape}; give float(reward)", warning=True)
             reward = reward.reshape(-1)[0]
         number = isinstance(reward, (int, float, np.integer, np.floating)) and not isinstance(reward, bool)
         if not number and not isinstance(reward, (bool, np.bool_)):
-            self.report.add("rewards", f"{who}: reward is {short(reward)}; give a number")
+            self.report.add("rewards", f"{place}: reward is {short(reward)}; give a number")
             return
         if not np.isfinite(reward):
-            self.report.add("finite", f"{who}: reward is {float(reward)}")
+            self.report.add("finite", f"{place}: reward is {float(reward)}")
         trace.append(np.float64(reward).tobytes())
 
     def _aliasing(self, where: str) -> None:
         for then, agent, value, before in self.returned:
-            if not _equal(value, before):
+            if not equal(value, before):
                 self.report.add(
-                    "aliasing", f'{then}, agent "{agent}": the observation was changed by {where.rsplit(", ", 1)[-1]}; return a copy'
+                    "aliasing",
+                    f'{then}, agent "{agent}": the observation was changed by {where.rsplit(", ", 1)[-1]}; return a copy',
                 )
                 return
 
     def _state(self, env: Any, where: str) -> None:
-        width = self.layout.state_width
+        # What the first reset told, whatever has become of it.
+        width = self.state_width
         if isinstance(env, Alone):
             return
         if not width:
@@ -337,7 +355,7 @@ class _Player:
         try:
             state = np.asarray(env.state())
         except Exception as error:
-            self.report.add("state", f"{where}: state(): {describe(error)}")
+            self.report.add("state", f"{where}: state(): {describe(error)}; repair it, or serve with state=False")
             return
         if state.size != width:
             self.report.add("state", f"{where}: state() has {state.size} numbers, and {width} after the first reset")
@@ -352,21 +370,23 @@ class _Player:
         except (NotImplementedError, AttributeError):
             return
         except Exception as error:
-            self.report.add("state", f"{where}: state(): {describe(error)}; the critic sees all observations instead", warning=True)
+            self.report.add(
+                "state", f"{where}: state(): {describe(error)}; the critic sees all observations instead", warning=True
+            )
 
     # -- after an episode
 
     def _after_the_end(self, env: Any, name: str) -> None:
         try:
-            result = env.step({}) if not isinstance(env, Alone) else None
+            if not isinstance(env, Alone):
+                env.step({})
         except Exception:
             # To refuse a step after the end is right as well.
             return
         if env.agents:
-            self.report.add("after the end", f"{name}: agents has {names(env.agents)} again after the end; it must stay empty until reset")
-        elif isinstance(result, tuple) and result and isinstance(result[0], dict) and result[0]:
-            text = f"{name}: step({{}}) after the end returns observations of {names(result[0])}; return empty dicts"
-            self.report.add("after the end", text, warning=True)
+            self.report.add(
+                "after the end", f"{name}: agents has {names(env.agents)} again after the end; it must stay empty until reset"
+            )
 
     def _limits(self) -> None:
         limit = self.layout.steps_max
@@ -401,7 +421,12 @@ class _Player:
         except Exception as error:
             self.report.add("pictures", f"render(): {describe(error)}")
             return
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] not in (3, 4) or picture.dtype != np.uint8:
+        if (
+            not isinstance(picture, np.ndarray)
+            or picture.ndim != 3
+            or picture.shape[2] not in (3, 4)
+            or picture.dtype != np.uint8
+        ):
             self.report.add("pictures", f"render() returns {short(picture)}; return an array [height, width, 3] of uint8")
 
     def _again(self, env: Any) -> None:
@@ -417,51 +442,3 @@ class _Player:
             second.close()
         except Exception as error:
             self.report.add("make", f"a second environment, after close() of the first: {describe(error)}")
-
-
-def _contains(space: Any, value: Any) -> bool:
-    try:
-        return bool(space.contains(value))
-    except Exception:
-        return False
-
-
-def _outside(space: Any, value: Any) -> str:
-    """Why a value is not in a space, as far as that can be said."""
-    if kind(space) == "Box":
-        array = np.asarray(value)
-        outside = (array < space.low) | (array > space.high)
-        if outside.any():
-            at = tuple(int(i) for i in np.argwhere(outside)[0])
-            where = at[0] if len(at) == 1 else at
-            return f"number {where} is {array[at]}, and its bounds are {space.low[at]} to {space.high[at]}"
-        return f"{array.dtype} of shape {array.shape}, and the space is {short(space)}"
-    return f"{short(value)}, and the space is {short(space)}"
-
-
-def _dtypes(report: Report, who: str, space: Any, value: Any, field: str) -> None:
-    name = kind(space)
-    if name in ("Box", "MultiBinary", "MultiDiscrete"):
-        dtype = getattr(value, "dtype", None)
-        if not isinstance(value, np.ndarray):
-            report.add("dtypes", f"{who}: {field} is a {type(value).__name__}; return a NumPy array of {space.dtype}")
-        elif dtype != space.dtype:
-            report.add("dtypes", f"{who}: {field} has dtype {dtype}, and its space {space.dtype}")
-    elif name == "Dict":
-        for key, part in space.spaces.items():
-            _dtypes(report, who, part, value[key], f"{field}[{key!r}]")
-    elif name == "Tuple":
-        for key, part in enumerate(space.spaces):
-            _dtypes(report, who, part, value[key], f"{field}[{key!r}]")
-
-
-def _equal(a: Any, b: Any) -> bool:
-    """Equal bit by bit; NaN equals itself."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
-    if isinstance(a, (tuple, list)) and isinstance(b, (tuple, list)):
-        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b))
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        x, y = np.asarray(a), np.asarray(b)
-        return x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
-    return bool(a == b) or (a != a and b != b)

@@ -79,19 +79,25 @@ def _play(layout: Layout, report: Report, worlds: VectorWorlds, seeds: list[int]
         alike = alike and _alike(batch)
         report.steps += count - len(again)
         over = ~batch.active.any(axis=1) & (batch.terminated | batch.truncated).any(axis=1)
-        for w in np.flatnonzero(over):
+        for w in np.flatnonzero(over).tolist():
             if layout.steps_max and length[w] == layout.steps_max:
                 cut += 1
                 wrong += int(batch.terminated[w].any() and not batch.truncated[w].any())
         late = batch.active.any(axis=1) & (length == layout.steps_max + 1)
         if layout.steps_max and late.any():
             w = int(np.argmax(late))
-            report.add("limits", f"world {w}: the episode goes on after step {layout.steps_max}, its limit; end it, or correct the limit")
+            report.add(
+                "limits", f"world {w}: the episode goes on after step {layout.steps_max}, its limit; end it, or correct the limit"
+            )
     if wrong and wrong == cut:
-        text = f"{wrong} episodes end at their limit of {layout.steps_max} steps with terminated; that is a truncation, after which "
+        text = (
+            f"{wrong} episodes end at their limit of {layout.steps_max} steps with terminated; that is a truncation, after which "
+        )
         report.add("limits", text + "the rest of the episode still has a value", warning=wrong < 2)
     if alike:
-        report.add("other seed", f"{count} worlds with the seeds {seeds[0]} to {seeds[-1]} and equal actions are equal", warning=True)
+        report.add(
+            "other seed", f"{count} worlds with the seeds {seeds[0]} to {seeds[-1]} and equal actions are equal", warning=True
+        )
 
 
 def _alike(batch: Batch) -> bool:
@@ -141,8 +147,15 @@ def _pictures(layout: Layout, report: Report, worlds: VectorWorlds) -> None:
 def _rule_of(sentence: str) -> str:
     """Training's sentence under the rule that it belongs to."""
     for word, rule in (
-        ("mask", "masks"), ("states()", "state"), ("state()", "state"), ("finite", "finite"), ("reward", "rewards"),
-        ("terminated", "ends"), ("truncated", "ends"), ("reset", "reset"), ("observations", "observations"),
+        ("mask", "masks"),
+        ("states()", "state"),
+        ("state()", "state"),
+        ("finite", "finite"),
+        ("reward", "rewards"),
+        ("terminated", "ends"),
+        ("truncated", "ends"),
+        ("reset", "reset"),
+        ("observations", "observations"),
     ):
         if word in sentence:
             return rule

@@ -24,13 +24,21 @@ FIRST_SEED = 1
 class Environment:
     """Makes environments, and knows what they are once one has been made."""
 
-    def __init__(self, make: Callable[..., Any], worlds: int | None = None, pad: bool = False, renders: bool | None = None) -> None:
+    def __init__(
+        self,
+        make: Callable[..., Any],
+        worlds: int | None = None,
+        pad: bool = False,
+        state: bool = True,
+        renders: bool | None = None,
+    ) -> None:
         if not callable(make):
             raise Refused(f"make: {short(make)} cannot be called; give a function, or a class, that returns an environment")
         self._make = make
         self._takes_count = takes_count(make)
         self.worlds_max = worlds or 0
         self.pad = pad
+        self.state = state
         self.renders = renders
         self._layout: Layout | None = None
         self._kind = ""
@@ -117,7 +125,7 @@ class Environment:
         if any(info_masks):
             found.info_masks = info_masks
             found.__post_init__()
-        found.state_width = _state_width(env)
+        found.state_width = _state_width(env) if self.state else 0
         return found
 
     def _read_vector(self, env: VectorEnvironment) -> Layout:
@@ -140,10 +148,10 @@ class Environment:
             if isinstance(env, GymnasiumVector)
             else type(env).render is not VectorEnvironment.render
         )
-        if any(codec.has_mask for codec in found.observations) or found.observations[0].shape is None and len(set(agents)) == 1:
+        if any(codec.shape is None for codec in found.observations):
             raise Refused(
-                f"observation_space: {short(found.observations[0].space)}; a vector environment needs a Box "
-                "(return masks from masks())"
+                f"observation_space: {short(found.observations[0].space)}; a vector environment needs a Box: "
+                "flatten it, and return masks from masks()"
             )
         worlds = found.worlds_max or 1
         try:
@@ -154,7 +162,7 @@ class Environment:
         if masks is not None:
             found.info_masks = [True] * len(agents)
             found.__post_init__()
-        if states is not None:
+        if states is not None and self.state:
             shape = np.shape(states)
             if len(shape) != 2:
                 raise broke(0, None, "states()", "shape (W, S)", f"shape {shape}")

@@ -57,7 +57,7 @@ def layout(
         raise Refused("possible_agents: a name occurs twice; give every agent a name of its own")
     for agent in agents:
         if not isinstance(agent, str):
-            raise Refused(f"possible_agents: {short(agent)} is no string; name agents with strings such as \"agent_0\"")
+            raise Refused(f'possible_agents: {short(agent)} is no string; name agents with strings such as "agent_0"')
     seen = {agent: observation_space(agent) for agent in agents}
     taken = {agent: action_space(agent) for agent in agents}
     observations = [ObservationCodec(seen[agent], agent) for agent in agents]
@@ -108,7 +108,9 @@ class Batch:
         self.truncated = np.zeros((worlds, n), np.bool_)
         self.active = np.zeros((worlds, n), np.bool_)
         # [W, N, H, largest], from which the wire's [W, N, sum of choices] is taken.
-        self.masks = np.broadcast_to(layout.actions.allowed, (worlds, *layout.actions.allowed.shape)).copy() if layout.masks else None
+        self.masks = (
+            np.broadcast_to(layout.actions.allowed, (worlds, *layout.actions.allowed.shape)).copy() if layout.masks else None
+        )
         self.states = np.zeros((worlds, layout.state_width), np.float64) if layout.state_width else None
         self.successes = np.zeros(worlds, np.bool_)
         # Whether anything was said of success where an episode ended.

@@ -7,6 +7,7 @@ into lists and become arrays once. A world in which an agent has left, or that r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from magex._layout import Batch, Layout
 from magex._observations import Unfit
-from magex._problems import Problem, broke, names, raised, request, short
+from magex._problems import Problem, StateProblem, broke, names, raised, short
 
 
 class Alone:
@@ -65,7 +66,7 @@ class Alone:
 
 
 class _World:
-    """One environment object and who acts in it."""
+    """One environment object and the agents that act in it."""
 
     __slots__ = ("env", "alive", "ghosts", "spoiled", "said")
 
@@ -75,7 +76,7 @@ class _World:
         self.alive: tuple[int, ...] = ()
         # Agents that ended and that the environment still lists.
         self.ghosts: set[int] = set()
-        # It raised: nobody knows in which state it is, and it is made anew.
+        # It raised: its state is not known, and it is made anew.
         self.spoiled = False
         # What infos said of success, so far in this episode.
         self.said: list[bool] = []
@@ -253,7 +254,10 @@ class ParallelWorlds:
             raise broke(w, None, "step", expected, f"{len(result)} values" if isinstance(result, tuple) else short(result))
         observations, rewards, terminations, truncations, infos = result
         parts = (
-            (observations, "observations"), (rewards, "rewards"), (terminations, "terminations"), (truncations, "truncations"),
+            (observations, "observations"),
+            (rewards, "rewards"),
+            (terminations, "terminations"),
+            (truncations, "truncations"),
         )
         for values, field in parts:
             self._known(w, values, field)
@@ -264,14 +268,14 @@ class ParallelWorlds:
                     raise broke(w, agent, field, "a value for every agent that acted", f"values of {names(values)}")
             self._observe(w, i, observations, batch)
             batch.rewards[w, i] = _number(w, agent, rewards[agent])
-            batch.terminated[w, i] = _flag(w, agent, "terminations", terminations[agent])
-            batch.truncated[w, i] = _flag(w, agent, "truncations", truncations[agent])
+            batch.terminated[w, i] = _flag(w, agent, terminations[agent], "terminations")
+            batch.truncated[w, i] = _flag(w, agent, truncations[agent], "truncations")
         self._after(w, batch.terminated[w] | batch.truncated[w], infos, batch, observations)
         if self.layout.own_masks:
             self._info_masks(w, infos, batch)
 
     def _after(self, w: int, ended: np.ndarray, infos: Any, batch: Batch, observations: Any = None) -> None:
-        """Who acts next in a world in which somebody ended, left or came."""
+        """Which agents act next in a world in which one ended, left or came."""
         world = self.worlds[w]
         before = world.alive
         live = set(self._alive(w, world.env))
@@ -281,9 +285,7 @@ class ParallelWorlds:
                 if said is not None:
                     world.said.append(said)
             elif i not in live:
-                raise broke(
-                    w, self.agents[i], "agents", "the agent, or its end in terminations or truncations", "neither"
-                )
+                raise broke(w, self.agents[i], "agents", "the agent, or its end in terminations or truncations", "neither")
         # An agent that ended and is still listed has ended all the same; one that was not listed before has come.
         came = live.difference(before, world.ghosts)
         world.ghosts = {i for i in live if i in world.ghosts or ended[i]}
@@ -311,10 +313,12 @@ class ParallelWorlds:
     def _state(self, w: int, world: _World, batch: Batch) -> None:
         if batch.states is None:
             return
-        state = self._call(w, "state", world.env.state)
-        flat = np.asarray(state).ravel()
-        if flat.shape != (self.layout.state_width,):
-            raise broke(w, None, "state()", f"{self.layout.state_width} numbers, as after the first reset", f"{flat.size}")
+        try:
+            flat = np.asarray(self._call(w, "state()", world.env.state)).ravel()
+            if flat.shape != (self.layout.state_width,):
+                raise broke(w, None, "state()", f"{self.layout.state_width} numbers, as after the first reset", flat.size)
+        except Problem as problem:
+            raise StateProblem(problem.kind, f"{problem.message}; serve with state=False if it is of no use", w) from problem
         batch.states[w] = flat
 
     # -- all worlds
@@ -337,13 +341,11 @@ class ParallelWorlds:
                 for i in self.all:
                     self._observe(w, i, values, batch)
         _fill(batch.rewards, where, fast, self.agents, rewards, _number)
-        for name, out, values in (
-            ("terminations", batch.terminated, terminated), ("truncations", batch.truncated, truncated)
-        ):
-            _fill(out, where, fast, self.agents, values, lambda w, agent, value, name=name: _flag(w, agent, name, value))
+        _fill(batch.terminated, where, fast, self.agents, terminated, partial(_flag, field="terminations"))
+        _fill(batch.truncated, where, fast, self.agents, truncated, partial(_flag, field="truncations"))
 
     def _finish(self, batch: Batch) -> Batch:
-        """What holds for all: states, who acts next, zeros for who does not, finite numbers."""
+        """What holds for all worlds: states, the agents that act next, zeros for the others, finite numbers."""
         for w, world in enumerate(self.worlds):
             batch.active[w, world.alive if world.alive is not self.all else slice(None)] = True
         ended = batch.terminated | batch.truncated
@@ -368,7 +370,7 @@ def finite(batch: Batch, layout: Layout) -> None:
     if batch.masks is not None:
         batch.masks &= batch.active[:, :, None, None]
         if layout.own_masks:
-            nothing = ~batch.masks.any(axis=3).all(axis=2) & batch.active
+            nothing = batch.active & ~np.all(batch.masks.any(axis=3), axis=2)
             if nothing.any():
                 w, i = (int(x) for x in np.argwhere(nothing)[0])
                 raise broke(w, layout.agents[i], "action_mask", "one allowed choice at least in every component", "none")
@@ -378,7 +380,9 @@ def _fill(out: np.ndarray, where: Any, fast: list[int], agents: Sequence[str], v
     try:
         array = np.array(values)
         # Anything but plain numbers or flags is looked at one by one.
-        plain = array.shape == (len(fast), len(agents)) and (array.dtype.kind == "b" or array.dtype.kind in "iuf" and out.dtype != np.bool_)
+        plain = array.shape == (len(fast), len(agents)) and (
+            array.dtype.kind == "b" or array.dtype.kind in "iuf" and out.dtype != np.bool_
+        )
     except ValueError:
         plain = False
     if plain:
@@ -400,7 +404,7 @@ def _number(w: int, agent: str, value: Any) -> float:
     raise broke(w, agent, "reward", "a number", short(value))
 
 
-def _flag(w: int, agent: str, field: str, value: Any) -> bool:
+def _flag(w: int, agent: str, value: Any, field: str) -> bool:
     array = np.asarray(value)
     if array.size == 1 and array.dtype.kind in "biu" and int(array.reshape(-1)[0]) in (0, 1):
         return bool(array.reshape(-1)[0])

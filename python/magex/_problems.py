@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
-import sys
 import sysconfig
 import traceback
 
 import numpy as np
 
-RAISED, BROKE_ITS_WORD, REQUEST = 1, 2, 3
+from magex._wire.environment_pb2 import EnvironmentProblem
+
+Kind = EnvironmentProblem.Kind
+RAISED, BROKE_ITS_WORD, REQUEST = EnvironmentProblem.RAISED, EnvironmentProblem.BROKE_ITS_WORD, EnvironmentProblem.REQUEST
 
 _HERE = os.path.dirname(os.path.abspath(__file__)) + os.sep
-_INSTALLED = tuple({sysconfig.get_path("stdlib") + os.sep, sysconfig.get_path("purelib") + os.sep, sys.base_prefix + os.sep})
+_INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "purelib", "platlib")})
 
 
 class Refused(Exception):
@@ -22,11 +24,15 @@ class Refused(Exception):
 class Problem(Exception):
     """One request failed. The stream stays usable."""
 
-    def __init__(self, kind: int, message: str, world: int | None = None) -> None:
+    def __init__(self, kind: Kind, message: str, world: int | None = None) -> None:
         super().__init__(message)
         self.kind = kind
         self.message = message
         self.world = world
+
+
+class StateProblem(Problem):
+    """state() failed, without which a team can be trained too."""
 
 
 def request(message: str) -> Problem:
@@ -36,14 +42,14 @@ def request(message: str) -> Problem:
 
 def broke(world: int, agent: str | None, field: str, expected: object, seen: object) -> Problem:
     """The environment's fault: it returned what its description does not allow."""
-    who = f'world {world}, agent "{agent}"' if agent is not None else f"world {world}"
-    return Problem(BROKE_ITS_WORD, f"{who}, {field}: expected {expected}, seen {seen}", world)
+    place = f'world {world}, agent "{agent}"' if agent is not None else f"world {world}"
+    return Problem(BROKE_ITS_WORD, f"{place}, {field}: expected {expected}, seen {seen}", world)
 
 
 def raised(error: BaseException, during: str, world: int | None = None) -> Problem:
     """The environment's fault: it raised an exception."""
-    who = f"world {world}, {during}" if world is not None else during
-    return Problem(RAISED, f"{who}: {describe(error)}", world)
+    place = f"world {world}, {during}" if world is not None else during
+    return Problem(RAISED, f"{place}: {describe(error)}", world)
 
 
 def describe(error: BaseException) -> str:
@@ -51,8 +57,8 @@ def describe(error: BaseException) -> str:
     text = " ".join(str(error).split())
     if len(text) > 500:
         text = text[:500] + "…"
-    place = frame(error)
-    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
+    line = frame(error)
+    return f"{type(error).__name__}: {text}" + (f" ({line})" if line else "")
 
 
 def frame(error: BaseException) -> str:

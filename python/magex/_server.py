@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hmac
+import io
 import ipaddress
 import os
 import signal
@@ -35,7 +36,9 @@ def serve(
     worlds: int | None = None,
     address: str | None = None,
     deterministic: bool | None = None,
+    successes: bool | None = None,
     pad: bool = False,
+    state: bool = True,
     renders: bool | None = None,
     tls_certificate: str | os.PathLike[str] | None = None,
     tls_key: str | os.PathLike[str] | None = None,
@@ -50,15 +53,18 @@ def serve(
     * worlds: largest number of worlds that one caller may have; None is any.
     * address: HOST:PORT where an environment listens that no actor started; None is `--address` of the command line, or a free
       port of 127.0.0.1. An actor says by the environment variable MAGEX_ENVIRONMENT_SOCKET where to listen instead.
-    * deterministic: whether an episode is a function of its seed and its actions; None plays some to find out.
+    * deterministic: whether an episode is a function of its seed and its actions; None plays 200 steps to find out.
+    * successes: whether infos say at the end of an episode if it was a success (`is_success` or `success`); None looks in the
+      same steps. With both given nothing is played.
     * pad: fills up observations and actions of agents that have smaller spaces than others.
+    * state: False never asks for state(); the critic then sees all observations.
     * renders: False never renders; None renders if the environment's render_mode is "rgb_array".
     * tls_certificate, tls_key: PEM files, and token: what callers must present. Beyond loopback all three are needed, unless
       insecure=True.
     """
     try:
-        environment = Environment(make, worlds=worlds, pad=pad, renders=renders)
-        service = Service(environment, deterministic)
+        environment = Environment(make, worlds=worlds, pad=pad, state=state, renders=renders)
+        service = Service(environment, deterministic, successes)
         socket = os.environ.get(SOCKET)
         if socket:
             _serve_actor(service, socket)
@@ -70,7 +76,9 @@ def serve(
         raise SystemExit(1) from None
 
 
-def start(service: Service, address: str, credentials: grpc.ServerCredentials | None = None, token: str | None = None) -> tuple[grpc.Server, int]:
+def start(
+    service: Service, address: str, credentials: grpc.ServerCredentials | None = None, token: str | None = None
+) -> tuple[grpc.Server, int]:
     """Listens; returns the server and its port."""
     server = grpc.server(
         futures.ThreadPoolExecutor(max_workers=STREAMS_MAX, thread_name_prefix="magex"),
@@ -100,6 +108,9 @@ def _serve_actor(service: Service, socket: str) -> None:
     if threading.current_thread() is threading.main_thread():
         # Ctrl-C reaches the whole terminal. The actor finishes its work first, and needs its environment for that.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The actor logs what the environment prints; in a pipe Python would hold it back.
+        sys.stdout.reconfigure(line_buffering=True)
     threading.Thread(target=_end_with_input, daemon=True, name="magex-parent").start()
     # A server without a reference to it is collected, and its socket removed.
     server, _ = start(service, f"unix:{socket}")
@@ -201,12 +212,10 @@ class _Token(grpc.ServerInterceptor):
         self.expected = f"Bearer {token}".encode()
 
         def refuse(_: Any, context: grpc.ServicerContext) -> None:
-            context.abort(
-                grpc.StatusCode.UNAUTHENTICATED, "authorization: missing or wrong; send 'authorization: Bearer TOKEN'"
-            )
+            context.abort(grpc.StatusCode.UNAUTHENTICATED, "authorization: missing or wrong; send 'authorization: Bearer TOKEN'")
 
-        self.unary = grpc.unary_unary_rpc_method_handler(refuse)
-        self.stream = grpc.stream_stream_rpc_method_handler(refuse)
+        self.unary: Any = grpc.unary_unary_rpc_method_handler(refuse)
+        self.stream: Any = grpc.stream_stream_rpc_method_handler(refuse)
 
     def intercept_service(self, continuation: Callable[..., Any], details: Any) -> Any:
         given = dict(details.invocation_metadata).get("authorization", "")

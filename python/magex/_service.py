@@ -27,12 +27,12 @@ _TYPES = {np.dtype(np.float32): types_pb2.DATA_TYPE_F32, np.dtype(np.float64): t
 class Service(environment_pb2_grpc.EnvironmentServiceServicer):
     """Every stream has worlds of its own; Describe is computed once."""
 
-    def __init__(self, environment: Environment, deterministic: bool | None = None) -> None:
+    def __init__(self, environment: Environment, deterministic: bool | None = None, successes: bool | None = None) -> None:
         self.environment = environment
         self.deterministic = deterministic
+        self.successes = successes
         self._lock = threading.Lock()
         self._description: pb.EnvironmentDescription | None = None
-        self._successes: bool | None = None
 
     def Describe(self, message: pb.DescribeRequest, context: grpc.ServicerContext) -> pb.EnvironmentDescription:
         if message.protocol != PROTOCOL:
@@ -53,10 +53,12 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
         with self._lock:
             if self._description is None:
                 layout = self.environment.layout()
-                found = _probe.play(self.environment)
-                deterministic = found.deterministic if self.deterministic is None else self.deterministic
-                self._successes = found.successes
-                self._description = describe_layout(layout, deterministic, found.successes)
+                deterministic, successes = self.deterministic, self.successes
+                if deterministic is None or successes is None:
+                    found = _probe.play(self.environment)
+                    deterministic = found.deterministic if deterministic is None else deterministic
+                    successes = found.successes if successes is None else successes
+                self._description = describe_layout(layout, deterministic, successes)
             return self._description
 
     def Run(self, requests: Iterator[pb.EnvironmentRequest], context: grpc.ServicerContext) -> Iterator[pb.EnvironmentReply]:
@@ -67,6 +69,8 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
             text = str(error) if isinstance(error, (Refused, Problem)) else f"make: {describe(error)}"
             context.abort(grpc.StatusCode.FAILED_PRECONDITION, text)
             return
+        # Some clients wait for the head of the answer before they send a request.
+        context.send_initial_metadata(())
         try:
             for message in requests:
                 yield stream.answer(message)
@@ -110,10 +114,8 @@ class Stream:
                 problem=pb.EnvironmentProblem(kind=problem.kind, message=problem.message, world=problem.world)
             )
         except Exception as error:
-            # Nothing of the environment's ends the stream, not even what nobody thought of.
-            return pb.EnvironmentReply(
-                problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error))
-            )
+            # Nothing of the environment's ends the stream, not even what is handled nowhere else.
+            return pb.EnvironmentReply(problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error)))
 
     def _reset(self, message: pb.EnvironmentReset) -> Batch:
         seeds = list(message.seeds)

@@ -21,9 +21,11 @@ class VectorEnvironment:
     * `step(actions)`: actions is [W, N] (Discrete), [W, N, H] (MultiDiscrete, MultiBinary) or [W, N, *shape] (Box).
       Returns observations [W, N, ...], rewards [W, N], terminated [W, N] and truncated [W, N];
       the last three may be [W] if they are the same for all agents.
-      Worlds and agents that are over are stepped too, with actions of zeros: nobody looks at what they give.
+      Worlds and agents that are over are stepped too, with actions of zeros: what they give is ignored.
     * `restart(which, seeds)`: begins a new episode in the K worlds `which`, int64 [K], seeds uint32 [K].
       Returns the observations of these, [K, N, ...]. Other worlds must not change.
+
+    If agents have observations of different sizes (pad=True), observations are [W, N, V] with the largest size.
 
     An episode must be a function of its seed and its actions, not of the world's index or of what the other worlds do;
     `magex.uniform` draws random numbers that way.
@@ -266,12 +268,10 @@ class VectorWorlds:
             array = self._array(observations, f"observations of {during}", (worlds, count, *layout.shape))
             batch.observations[where] = array.reshape(worlds, count, layout.width)
             return
-        width = layout.width
-        if isinstance(observations, np.ndarray) and observations.dtype.kind in "biuf" and observations.shape[2:] == (width,):
-            # Padded by the environment itself.
-            batch.observations[where] = self._array(observations, f"observations of {during}", (worlds, count, width))
-            return
-        raise broke(0, None, f"observations of {during}", f"an array of shape {(worlds, count, width)}", short(observations))
+        # Agents of different sizes: the environment fills up itself, with whatever it likes.
+        array = self._array(observations, f"observations of {during}", (worlds, count, layout.width))
+        own = np.arange(layout.width) < np.array([codec.width for codec in layout.observations])[:, None]
+        batch.observations[where] = np.where(own, array, 0.0)
 
     def _array(self, value: Any, field: str, shape: tuple[int, ...]) -> np.ndarray:
         try:

@@ -37,11 +37,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--worlds", type=int, metavar="W", help="largest number of worlds of one caller [default: any]")
     parser.add_argument("--address", metavar="HOST:PORT", help="where to listen [default: a free port of 127.0.0.1]")
     parser.add_argument("--pad", action="store_true", help="fill up the smaller spaces of agents whose spaces differ")
+    parser.add_argument("--no-state", action="store_true", help="never ask for state(): the critic sees all observations")
     parser.add_argument("--deterministic", choices=("yes", "no"), help="[default: find out]")
     parser.add_argument("--tls-certificate", metavar="FILE")
     parser.add_argument("--tls-key", metavar="FILE")
     parser.add_argument("--token-file", metavar="FILE", help="[default: the environment variable MAGEX_TOKEN]")
-    parser.add_argument("--insecure", action="store_true", help="answer everyone who can reach the address")
+    parser.add_argument("--insecure", action="store_true", help="answer every client that can reach the address")
     options = parser.parse_args(arguments)
     try:
         make = load(options.environment)
@@ -61,6 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
         address=options.address,
         deterministic=None if options.deterministic is None else options.deterministic == "yes",
         pad=options.pad,
+        state=not options.no_state,
         tls_certificate=options.tls_certificate,
         tls_key=options.tls_key,
         token=token,
