@@ -41,9 +41,14 @@ fn every_variable_is_one_that_a_program_reads() {
         .concat();
     let known = names(&help, "MAGEX_", is_variable);
     assert!(known.len() > 15, "{known:?}");
-    for file in
-        ["compose.yaml", "compose.tls.yaml", "k8s/base/learner.yaml", "k8s/base/commander.yaml", "k8s/base/actor.yaml"]
-    {
+    for file in [
+        "compose.yaml",
+        "compose.tls.yaml",
+        "compose.environment.yaml",
+        "k8s/base/learner.yaml",
+        "k8s/base/commander.yaml",
+        "k8s/base/actor.yaml",
+    ] {
         let text = read(file);
         // In compose files: what is set, not what is filled in from .env.
         let set = text.lines().filter_map(|line| {
@@ -61,7 +66,7 @@ fn every_variable_is_one_that_a_program_reads() {
 #[test]
 fn every_setting_of_the_compose_files_has_a_default() {
     let defaults = read(".env");
-    for file in ["compose.yaml", "compose.tls.yaml"] {
+    for file in ["compose.yaml", "compose.tls.yaml", "compose.environment.yaml"] {
         let text = read(file);
         for (start, _) in text.match_indices("${") {
             let name = text[start + 2..].split('}').next().unwrap();
