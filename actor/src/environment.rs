@@ -118,7 +118,7 @@ impl Environments {
         Self { source, expected: expected.clone(), idle: Mutex::default() }
     }
 
-    /// Uses an environment that nobody else uses meanwhile. One that is lost is replaced and `work` is done again from its start;
+    /// Uses an environment that no other thread uses meanwhile. One that is lost is replaced and `work` is done again from its start;
     /// so it is, once, after an exception and a broken word.
     pub fn with<T>(
         &self,

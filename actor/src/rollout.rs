@@ -38,7 +38,7 @@ pub enum RolloutError<E> {
     /// No goals.
     #[error("goals: {0}")]
     Goals(E),
-    /// The environment of somebody else.
+    /// The external environment.
     #[error(transparent)]
     Environment(EnvironmentError),
     /// The policy's outputs are not finite.

@@ -1,5 +1,5 @@
-//! Rolling out a shard in an environment of somebody else. Its worlds run side by side for T steps. A world whose episode ends before
-//! begins another one with the next step of its own stream of seeds, in which nobody acts: the state before it is the true last one,
+//! Rolling out a shard in an external environment. Its worlds run side by side for T steps. A world whose episode ends before
+//! begins another one with the next step of its own stream of seeds, in which no agent acts: the state before it is the true last one,
 //! whose value the learner needs if the episode was cut. An evaluation plays one episode in each world.
 
 use super::policy::{Carried, KeyedChooser};

@@ -375,7 +375,7 @@ impl RunConfig {
         Ok(())
     }
 
-    /// Checks what an environment of somebody else cannot be combined with.
+    /// Checks what an external environment cannot be combined with.
     fn check_external(&self) -> Result<(), FieldError> {
         if self.task.name != TaskName::External {
             return Ok(());

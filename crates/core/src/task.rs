@@ -39,7 +39,7 @@ pub enum TaskName {
     PushBall,
     /// Quadrotors on a rigid-body engine (paper, section 5.1.2).
     Drones,
-    /// An environment of somebody else, behind `EnvironmentService`.
+    /// An external environment, behind `EnvironmentService`.
     External,
 }
 

@@ -79,7 +79,7 @@ pub struct Trajectory {
     /// [T, B, N, A] 1 for a choice that was allowed; empty if all always are.
     pub masks: Vec<u8>,
     /// [T+1, B, N] see [`mark`]; empty if every agent acts in every step and episodes end at the horizon only. A world whose
-    /// episode has ended begins another one in the next step, in which nobody acts: the state before it is the true last one.
+    /// episode has ended begins another one in the next step, in which no agent acts: the state before it is the true last one.
     pub marks: Vec<u8>,
     /// [T+1, B, S] state of the worlds.
     pub world_states: Vec<f32>,

@@ -109,12 +109,25 @@ impl std::fmt::Debug for TeamPolicy {
     }
 }
 
+/// Refuses the policies of external environments: what they see is known to the environment alone.
+pub(crate) fn check_simulated(config: &RunConfig) -> Result<(), ParamError> {
+    match config.task.external() {
+        Ok(external) => Err(ParamError::Mismatch(format!(
+            "task: {} is an environment of its own, which makes the observations; acting, traces and exports know the \
+             simulated tasks, for this one there are magex eval and magex replay",
+            external.environment
+        ))),
+        Err(_) => Ok(()),
+    }
+}
+
 impl TeamPolicy {
     /// Loads it for the team size of `config.task`.
     ///
     /// # Errors
     /// The weights do not fit the configuration.
     pub fn load(config: &RunConfig, weights: &[u8]) -> Result<Self, ParamError> {
+        check_simulated(config)?;
         let model = Model::new(config)?;
         let policy = model.load_policy(weights)?;
         Ok(Self { model, policy, task: config.task.clone(), values: config.run.algorithm.off_policy() })

@@ -1,5 +1,6 @@
 //! What every export shares: the policy, what it says about itself, and why it cannot be exported.
 
+use crate::acting::check_simulated;
 use crate::tensors::Tensors;
 use magex_core::about::About;
 use magex_core::config::RunConfig;
@@ -40,6 +41,7 @@ impl<'a> Source<'a> {
     /// # Errors
     /// The weights do not fit the configuration.
     pub fn load(config: &'a RunConfig, weights: &[u8]) -> Result<Self, ExportError> {
+        check_simulated(config)?;
         let tensors = Tensors::load(config, weights)?;
         Ok(Self { config, about: About::of(config), weights_sha256: sha256::hex(weights), tensors })
     }

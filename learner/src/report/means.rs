@@ -119,9 +119,10 @@ mod tests {
         assert_eq!(summarise([]), None);
         let greedy = "\"success_rate\":0.5,\"matched_success_rate\":0.25,\"all_covered_rate\":0.25,\"arrival_step\":0.25,\
             \"collisions_per_agent_step\":0.25,\"collision_rate\":0.25,\"spawn_success_rate\":0.25,\"cost_ratio\":0.25,\
-            \"second_cost_ratio\":null";
+            \"second_cost_ratio\":null,\"episode_return\":0.25,\"episode_length\":0.25";
         let sampled = "\"sampled_success_rate\":null,\"sampled_collisions_per_agent_step\":null,\
-            \"sampled_collision_rate\":null,\"sampled_cost_ratio\":null,\"reward\":null";
+            \"sampled_collision_rate\":null,\"sampled_cost_ratio\":null,\"reward\":null,\
+            \"sampled_episode_return\":null,\"sampled_episode_length\":null";
         let line = serde_json::to_string(&IterationMeans { greedy: Some(summary), sampled: None }).unwrap();
         assert_eq!(line, format!("{{{greedy},{sampled}}}"));
         // Means of single-precision numbers print as such, as text and as a value.

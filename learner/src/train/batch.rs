@@ -231,7 +231,7 @@ fn episode_features(spec: &FeatureSpec, t: &Trajectory, b: usize) -> Features {
     let episode = |data: &[f32], width: usize| rows(data, place, width);
     let marks = rows(&t.marks, place, s.marks * s.agents);
     let mut masks = rows(&t.masks, (s.steps, s.episodes, b), s.agents * s.masks);
-    // Nobody acts in the last state.
+    // No agent acts in the last state.
     masks.resize((s.steps + 1) * s.agents * s.masks, 1);
     spec.compute(&JointState {
         positions: &episode(&t.positions, s.bodies * s.dims),

@@ -1,4 +1,4 @@
-//! An environment of somebody else, which an actor calls over gRPC, as data: what it said about itself.
+//! An external environment, which an actor calls over gRPC, as data: what it said about itself.
 
 use super::definition::{Definition, wrong_task};
 use super::{ActionCode, Bounds, Observation, TaskConfig, TaskName, TaskSettings};
