@@ -161,6 +161,7 @@ pub struct EvalOutcome {
 }
 
 /// Result of a shard of either kind.
+#[allow(clippy::large_enum_variant, reason = "most are of the large one, and there are few")]
 #[derive(Debug, Clone, PartialEq)]
 pub enum ShardResult {
     /// A trajectory to train on.

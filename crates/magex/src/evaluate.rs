@@ -7,6 +7,7 @@ use crate::local::{LoadedPolicy, commander};
 use crate::logging::set_live_line;
 use crate::planning_clock::PlanningClock;
 use indicatif::{ProgressBar, ProgressStyle};
+use magex_actor::environment::Environments;
 use magex_actor::rollout::Roller;
 use magex_assign::POWERS;
 use magex_core::config::{Algorithm, CommanderPolicy, RunConfig};
@@ -18,7 +19,7 @@ use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
 use magex_runtime::options;
 use magex_runtime::sync::lock;
 use std::path::PathBuf;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Evaluation set of `magex eval` unless another is named.
@@ -139,13 +140,18 @@ impl Subject {
         Ok((trained, config))
     }
 
+    /// The environments of an external task.
+    pub(crate) fn environments(&self, config: &RunConfig) -> anyhow::Result<Option<Arc<Environments>>> {
+        self.environment.of_run(config)
+    }
+
     /// What rolls the episodes out, and what a controller without weights took for it.
     pub(crate) fn policy(
         &self,
         config: &RunConfig,
         weights: &[u8],
     ) -> anyhow::Result<(LoadedPolicy, Option<PlanningClock>)> {
-        let environments = self.environment.of_run(config)?;
+        let environments = self.environments(config)?;
         let (mut policy, planning) = self.vary.policy(config, weights)?;
         policy.roller.environments = environments;
         Ok((policy, planning))

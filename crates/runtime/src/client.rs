@@ -240,7 +240,7 @@ impl Service<Uri> for Local {
     }
 }
 
-/// A connected channel to a Unix socket, without credentials: the file system says who may use it.
+/// A connected channel to a Unix socket, without credentials: the file system says which processes may use it.
 pub async fn connect_local(path: &Path) -> Result<Channel, transport::Error> {
     let endpoint = transport::Endpoint::from_static("http://localhost");
     let channel = endpoint.connect_with_connector(Local(path.to_owned())).await?;

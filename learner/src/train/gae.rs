@@ -116,7 +116,7 @@ mod tests {
     fn an_end_has_no_future_and_a_cut_has_the_value_of_its_last_state() {
         let gae = Gae { gamma: 0.5, lambda: 0.5, bootstrap: true };
         let (mut a, mut r) = ([0.0; 4], [0.0; 4]);
-        // Step 0 ends (or is cut) in state 1, in which nobody acts; states 2 and 3 are of the next episode.
+        // Step 0 ends (or is cut) in state 1, in which no agent acts; states 2 and 3 are of the next episode.
         for (ending, first) in [(mark::TERMINATED, 1.0 - 1.0), (mark::TRUNCATED, 1.0 + 0.5 * 3.0 - 1.0)] {
             let marks = [mark::ACTIVE | mark::FIRST, ending, mark::ACTIVE | mark::FIRST, mark::ACTIVE, mark::ACTIVE];
             gae.run((&[1.0, 0.0, 2.0, 4.0], &[1.0, 3.0, 5.0, 6.0, 8.0], &marks), 1, &mut a, &mut r);

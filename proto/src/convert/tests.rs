@@ -152,7 +152,6 @@ fn a_wrong_field_is_named_by_its_path() {
         marks: 0,
         goals_per_agent: 1,
         action_components: 1,
-        ..v1::Shape::default()
     };
     let body = v1::Trajectory {
         shape: Some(shape),

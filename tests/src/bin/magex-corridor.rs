@@ -3,7 +3,11 @@
 //! `magex-corridor [continuous] [masks] [impure] [FAULT FILE]` with FAULT one of raise, nan, hang, shape and exit: it happens in the
 //! seventh step of a stream if FILE does not exist, and FILE is made.
 
-#![allow(clippy::expect_used, reason = "a test's program stops where something is not as it should be")]
+#![allow(
+    clippy::expect_used,
+    clippy::print_stderr,
+    reason = "a test's program stops where something is not as it should be"
+)]
 
 use magex_proto::arrays;
 use magex_proto::v1::EnvironmentProblemKind as Kind;
@@ -34,7 +38,7 @@ struct Corridor {
     fault: Option<(String, PathBuf)>,
 }
 
-/// One world: where its agents are, where they want to go, and who is still on the way.
+/// One world: where its agents are, where they want to go, and which of them are still on the way.
 #[derive(Clone)]
 struct World {
     at: [i32; AGENTS],

@@ -15,11 +15,11 @@ section! {
         agent_names: Vec<String> = Vec::new();
         /// V: numbers of an agent's observation.
         observation_width: usize = 0, 1..=65_536;
-        /// [H] choices of each component of an action; empty if actions are vectors of real numbers.
+        /// `[H]` choices of each component of an action; empty if actions are vectors of real numbers.
         choices: Vec<usize> = Vec::new();
-        /// [C] lower bounds of the numbers of an action; infinite if there is none.
+        /// `[C]` lower bounds of the numbers of an action; infinite if there is none.
         low: Vec<f32> = Vec::new();
-        /// [C] upper bounds.
+        /// `[C]` upper bounds.
         high: Vec<f32> = Vec::new();
         /// S: numbers of the state of the whole world that a centralised critic sees; 0: it sees all observations.
         state_width: usize = 0, 0..=1_048_576;

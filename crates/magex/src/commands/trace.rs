@@ -66,8 +66,11 @@ pub(crate) fn run(args: &TraceArgs, options: &CommonOptions) -> anyhow::Result<u
     let (trained, config) = args.subject.load()?;
     if let Ok(external) = config.task.external() {
         let name = &external.environment;
-        return Err(usage(format!("RUN: its task is {name}, which makes its observations itself; there is nothing to trace")));
+        return Err(usage(format!(
+            "RUN: its task is {name}, which makes its observations itself; there is nothing to trace"
+        )));
     }
+    args.subject.environments(&config)?;
     let mut trace = episode(&config, &trained.weights, args)?;
     let about: Value = serde_json::from_str(&About::of(&config).to_json())?;
     trace.about.extend(about.as_object().cloned().unwrap_or_default());
