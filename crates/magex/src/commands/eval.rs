@@ -104,8 +104,10 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
         Some(hash) => format!("weights {hash}"),
         None => "no weights".to_owned(),
     };
+    let external = config.task.external().ok().map(|external| external.environment.clone());
+    let goals = if external.is_some() { String::new() } else { format!(" · scheduler {scheduler}") };
     note(format!(
-        "{} · {weights} · N = {} · {driver} · scheduler {scheduler} · {} episodes per row",
+        "{} · {weights} · N = {} · {driver}{goals} · {} episodes per row",
         trained.name, config.task.agents, args.episodes
     ));
 
@@ -139,12 +141,14 @@ pub(crate) fn run(args: &EvalArgs, options: &CommonOptions) -> anyhow::Result<u8
 
     let mut means = Map::new();
     let columns = METRICS.iter().filter(|metric| metric.applies(&config.task)).map(|metric| metric.label);
-    let timed = vary.controller != Controller::Learned;
-    let heading = ["spawn", "seed", "mode", "episodes"].into_iter().chain(columns);
+    let timed = rows.iter().any(|row| row.planning_ms.is_some());
+    let starts = if external.is_some() { "environment" } else { "spawn" };
+    let heading = [starts, "seed", "mode", "episodes"].into_iter().chain(columns);
     let heading: Vec<&str> = heading.chain(timed.then_some("planning ms")).collect();
     let mut table = Table::new(3, &heading);
     for row in &rows {
-        let mut cells = cells(&config.task, [row.spawn.to_string(), row.seed.to_string()], row.mode, &row.summary);
+        let starts = external.clone().unwrap_or_else(|| row.spawn.to_string());
+        let mut cells = cells(&config.task, [starts, row.seed.to_string()], row.mode, &row.summary);
         cells.extend(row.planning_ms.map(|ms| format!("{ms:.2}")));
         table.row(cells);
     }
