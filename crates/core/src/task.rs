@@ -109,6 +109,17 @@ pub enum RewardTarget {
     Team,
 }
 
+/// In which order a particle moves and is accelerated in a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Integration {
+    /// Velocities first: positions move with the new ones.
+    #[default]
+    VelocityFirst,
+    /// Positions first: they move with the old velocities, as in today's mpe2 and JaxMARL.
+    PositionFirst,
+}
+
 /// What only one task has, under the key of its section.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -141,6 +152,8 @@ pub struct TaskConfig {
     pub layout_scale: f32,
     /// What the reward pays for: each agent's own goals, or the team's coverage of all of them.
     pub reward_target: RewardTarget,
+    /// Order of a particle's step (Simple Spread).
+    pub integration: Integration,
     /// What only this task has.
     #[serde(flatten)]
     pub settings: TaskSettings,
@@ -157,6 +170,7 @@ struct RawTask {
     spawn: Option<Spawn>,
     layout_scale: Option<f32>,
     reward_target: RewardTarget,
+    integration: Integration,
     /// The task's own section, and whatever else there is.
     #[serde(flatten)]
     sections: Table,
@@ -230,6 +244,7 @@ pub(crate) fn read(keys: Table) -> Result<TaskConfig, FieldError> {
         spawn,
         layout_scale: raw.layout_scale.unwrap_or_else(|| (definition.layout_scale)(agents)),
         reward_target: raw.reward_target,
+        integration: raw.integration,
         settings: (definition.read_settings)(side, own)?,
     })
 }
@@ -246,7 +261,7 @@ fn own_section(name: TaskName, key: &str, value: Value) -> Result<Table, FieldEr
             None => FieldError::new(
                 field,
                 format!(
-                    "unknown key; use name, agents, side, horizon, spawn, layout_scale, reward_target or the section {own}"
+                    "unknown key; use name, agents, side, horizon, spawn, layout_scale, reward_target, integration or the section {own}"
                 ),
             ),
         }),
@@ -266,6 +281,7 @@ impl TaskConfig {
             spawn,
             layout_scale: (definition.layout_scale)(agents),
             reward_target: RewardTarget::default(),
+            integration: Integration::default(),
             settings: (definition.default_settings)(side),
         }
     }
@@ -364,6 +380,10 @@ impl TaskConfig {
         }
         check_range("task.horizon", self.horizon, 1, HORIZON_MAX)?;
         check_range("task.layout_scale", self.layout_scale, 0.01, 100.0)?;
+        if self.integration != Integration::default() && self.name != TaskName::SimpleSpread {
+            let problem = format!("position-first belongs to simple-spread; the task is {}; remove it", self.name);
+            return Err(FieldError::new("task.integration", problem));
+        }
         (self.definition().validate)(self)
     }
 

@@ -7,7 +7,7 @@ use super::physics::{Bodies, Physics};
 use super::swarm::Swarm;
 use crate::rules::{Rules, Score, Starts};
 use magex_core::error::FieldError;
-use magex_core::task::TaskConfig;
+use magex_core::task::{Integration, TaskConfig};
 
 /// Goals, reward and success of a particle task in W worlds to a block.
 pub(crate) trait Objective<const W: usize>: Sized + Send {
@@ -58,8 +58,9 @@ impl<const W: usize, O: Objective<W>> Batch<W, O> {
     pub(crate) fn new(task: &TaskConfig, starts: &Starts, cells: bool) -> Result<Self, FieldError> {
         let (agents, side, kinds) = (task.agents, f64::from(task.side), O::bodies(task.agents));
         let reach = f64::from(kinds.reach2()).sqrt();
+        let position_first = task.integration == Integration::PositionFirst;
         let swarm = Swarm::new(
-            Physics::standard(),
+            Physics { position_first, ..Physics::standard() },
             kinds,
             (agents, O::BODIES * agents),
             [&starts.positions, &starts.velocities, starts.landmarks()],

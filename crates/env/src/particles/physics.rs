@@ -1,8 +1,8 @@
 //! The multi-agent particle environment's physics for W worlds side by side.
 //!
 //! Arrays are `[bodies][W]`: element w of every array belongs to world w, and no operation mixes lanes, so a world's
-//! numbers do not depend on its neighbours. Per step: v ← (1 − damping) v + dt (u + F / m), x ← x + dt v, with u the
-//! control and F the contact forces at the positions before the step. Every pair closer than the sum of radii d0
+//! numbers do not depend on its neighbours. Per step: v ← (1 − damping) v + dt (u + F / m), x ← x + dt v (the other way
+//! round with `position_first`), with u the control and F the contact forces at the positions before the step. Every pair closer than the sum of radii d0
 //! (softly) repels along the line of centres with F = 100 k ln(1 + e^(−(d − d0)/k)).
 
 use super::real::{Real, softplus};
@@ -22,6 +22,8 @@ pub struct Physics<R> {
     pub inverse_margin: R,
     /// Force of an action.
     pub sensitivity: R,
+    /// Whether positions move with the velocity before the step, as today's mpe2 and JaxMARL have it.
+    pub position_first: bool,
 }
 
 impl<R: Real> Physics<R> {
@@ -34,6 +36,7 @@ impl<R: Real> Physics<R> {
             margin: R::from_f64(margin),
             inverse_margin: R::from_f64(1.0 / margin),
             sensitivity: R::from_f64(sensitivity),
+            position_first: false,
         }
     }
 
@@ -254,6 +257,28 @@ impl<R: Real, const W: usize> Motion<'_, R, W> {
         (fx, fy): (&[[R; W]], &[[R; W]]),
         control: impl Fn(usize) -> ([R; W], [R; W]),
     ) {
+        if physics.position_first {
+            for i in (0..self.x.len()).filter(|&i| bodies.movable(i)) {
+                for w in 0..W {
+                    self.x[i][w] = physics.dt.mul_add(self.vx[i][w], self.x[i][w]);
+                    self.y[i][w] = physics.dt.mul_add(self.vy[i][w], self.y[i][w]);
+                }
+            }
+            self.push::<B, false>(physics, bodies, (fx, fy), control);
+        } else {
+            self.push::<B, true>(physics, bodies, (fx, fy), control);
+        }
+    }
+
+    /// New velocities, and with them new positions if `MOVE`. A constant: the loop of a rollout has no branch.
+    #[inline(always)]
+    fn push<B: Bodies<R>, const MOVE: bool>(
+        &mut self,
+        physics: &Physics<R>,
+        bodies: &B,
+        (fx, fy): (&[[R; W]], &[[R; W]]),
+        control: impl Fn(usize) -> ([R; W], [R; W]),
+    ) {
         let n = self.x.len();
         let (x, y, vx, vy) = (&mut self.x[..n], &mut self.y[..n], &mut self.vx[..n], &mut self.vy[..n]);
         let (fx, fy) = (&fx[..n], &fy[..n]);
@@ -268,8 +293,10 @@ impl<R: Real, const W: usize> Motion<'_, R, W> {
                 let ay = fy[i][w].mul_add(inverse_mass, uy[w]);
                 vx[i][w] = physics.dt.mul_add(ax, physics.keep * vx[i][w]);
                 vy[i][w] = physics.dt.mul_add(ay, physics.keep * vy[i][w]);
-                x[i][w] = physics.dt.mul_add(vx[i][w], x[i][w]);
-                y[i][w] = physics.dt.mul_add(vy[i][w], y[i][w]);
+                if MOVE {
+                    x[i][w] = physics.dt.mul_add(vx[i][w], x[i][w]);
+                    y[i][w] = physics.dt.mul_add(vy[i][w], y[i][w]);
+                }
             }
         }
     }

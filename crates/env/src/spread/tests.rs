@@ -3,7 +3,7 @@ use crate::env::Env;
 use crate::tasks::{env_from_state, new_env};
 use magex_core::metrics_table::{ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP, MATCHED_SUCCESS_RATE, REWARD, SUCCESS_RATE};
 use magex_core::rng::{Key, Purpose};
-use magex_core::task::{RewardConfig, Spawn, TaskSettings};
+use magex_core::task::{Integration, RewardConfig, Spawn, TaskSettings};
 
 fn streams(count: u32) -> impl Iterator<Item = Stream> {
     (0..count).map(|episode| Key::new(3, Purpose::Spawn, &[0, 0, episode]).stream())
@@ -23,6 +23,26 @@ fn hand_made() -> (TaskConfig, Env) {
     let landmarks = [1.0, 0.0, -1.0, 0.0, 1.5, 1.5];
     let spread = env_from_state(&task, &positions, &[0.0; 6], &landmarks).unwrap();
     (task, spread)
+}
+
+#[test]
+fn with_positions_first_an_agent_moves_with_the_velocity_of_the_step_before() {
+    let mut task = task(2);
+    task.integration = Integration::PositionFirst;
+    // mpe2 1.1.1: x += 0.1 v, then v = 0.75 v + 0.1 a, with contacts of the places before the step.
+    let mut spread = env_from_state(&task, &[0.0, 0.0, 0.0, 0.125], &[0.0; 4], &[0.5; 4]).unwrap();
+    let apart = |y: f32| 100.0 * 1e-3 * ((-(y - 0.2) / 1e-3).exp().ln_1p());
+    let (mut x, mut v) = ([0.0f32, 0.125], [0.0f32; 2]);
+    for step in 0..6 {
+        let force =
+            if x[1] - x[0] < 0.25 { apart(x[1] - x[0]).min(100.0 * (0.2 - (x[1] - x[0])).max(0.0) + 0.1) } else { 0.0 };
+        spread.step(&[4, 3], &mut [0.0; 2]).unwrap();
+        x = [x[0] + 0.1 * v[0], x[1] + 0.1 * v[1]];
+        v = [0.75 * v[0] + 0.1 * (-5.0 - force), 0.75 * v[1] + 0.1 * (5.0 + force)];
+        let (p, s) = (spread.positions(), spread.velocities());
+        assert!((p[1] - x[0]).abs() < 1e-4 && (p[3] - x[1]).abs() < 1e-4, "step {step}: {p:?}, {x:?}");
+        assert!((s[1] - v[0]).abs() < 1e-3 && (s[3] - v[1]).abs() < 1e-3, "step {step}: {s:?}, {v:?}");
+    }
 }
 
 #[test]
