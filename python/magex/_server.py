@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from concurrent import futures
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import grpc
 
@@ -127,6 +127,11 @@ def _end_with_input() -> None:
             pass
     except OSError:
         pass
+    _end()
+
+
+def _end() -> NoReturn:
+    """Ends the process without waiting for a step that may never end."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -153,6 +158,7 @@ def _serve_address(
         server.wait_for_termination()
     except KeyboardInterrupt:
         server.stop(grace=None).wait(1.0)
+        _end()
 
 
 def check_address(

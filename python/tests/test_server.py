@@ -23,6 +23,18 @@ from magex._wire import environment_pb2_grpc
 HERE = Path(__file__).parent
 
 
+HANGS = """
+import time
+from environments import Line
+
+class Hangs(Line):
+    def step(self, actions):
+        print("hangs", flush=True)
+        while True:
+            time.sleep(1)
+"""
+
+
 def launch(*arguments: str, socket: Path | None = None, **variables: str) -> subprocess.Popen:
     env = {**os.environ, "PYTHONPATH": f"{HERE}:{os.environ.get('PYTHONPATH', '')}", **variables}
     env.pop("MAGEX_ENVIRONMENT_SOCKET", None)
@@ -60,14 +72,14 @@ def test_listens_where_the_actor_says_and_ends_with_its_input(tmp_path: Path) ->
 
 
 def test_ends_with_its_input_in_a_step_that_hangs(tmp_path: Path) -> None:
-    (tmp_path / "hangs.py").write_text(
-        "import time\nfrom environments import Line\n"
-        "class Hangs(Line):\n"
-        "    def step(self, actions):\n"
-        "        print('hangs', flush=True)\n"
-        "        while True: time.sleep(1)\n"
+    (tmp_path / "hangs.py").write_text(HANGS)
+    process = launch(
+        "-m",
+        "magex.serve",
+        "hangs:Hangs",
+        socket=tmp_path / "s",
+        PYTHONPATH=f"{HERE}:{tmp_path}:{os.environ.get('PYTHONPATH', '')}",
     )
-    process = launch("-m", "magex.serve", "hangs:Hangs", socket=tmp_path / "s", PYTHONPATH=f"{HERE}:{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     with grpc.insecure_channel(f"unix:{tmp_path}/s") as channel:
         call = environment_pb2_grpc.EnvironmentServiceStub(channel).Describe.future(
             pb.DescribeRequest(protocol=1), wait_for_ready=True
@@ -90,6 +102,19 @@ def test_prints_one_line_with_its_address() -> None:
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=5) == 0
     assert process.stderr.read() == ""
+
+
+def test_ctrl_c_in_a_step_that_hangs(tmp_path: Path) -> None:
+    (tmp_path / "hangs.py").write_text(HANGS)
+    path = f"{HERE}:{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
+    process = launch("-m", "magex.serve", "hangs:Hangs", "--address", "127.0.0.1:0", PYTHONPATH=path)
+    target = process.stdout.readline().strip().removeprefix("http://")
+    with grpc.insecure_channel(target) as channel:
+        call = environment_pb2_grpc.EnvironmentServiceStub(channel).Describe.future(pb.DescribeRequest(protocol=1))
+        assert process.stdout.readline() == "hangs\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=5) == 0
+        call.cancel()
 
 
 def test_a_file_of_the_users_own(tmp_path: Path) -> None:
