@@ -36,6 +36,11 @@ class Hangs(Line):
 """
 
 
+def hear_interrupts() -> None:
+    """A shell that runs the tests in the background has told them to ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.fixture
 def launch() -> Iterator[Callable[..., subprocess.Popen]]:
     """launch(arguments of Python, ...) starts a process that ends with the test."""
@@ -50,7 +55,8 @@ def launch() -> Iterator[Callable[..., subprocess.Popen]]:
         env.update(variables)
         pipe = subprocess.PIPE
         command = [sys.executable, *arguments]
-        processes.append(subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, stderr=pipe, text=True))
+        process = subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, stderr=pipe, text=True, preexec_fn=hear_interrupts)
+        processes.append(process)
         return processes[-1]
 
     yield start
