@@ -86,6 +86,8 @@ def start(
         options=[
             ("grpc.max_receive_message_length", MESSAGE_BYTES_MAX),
             ("grpc.max_send_message_length", MESSAGE_BYTES_MAX),
+            # During a long step a caller asks from time to time whether the connection lives. gRPC would take that for an attack.
+            ("grpc.http2.max_ping_strikes", 0),
             # Two environments on one port would share their callers at random.
             ("grpc.so_reuseport", 0),
         ],
