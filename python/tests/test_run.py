@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 
 import grpc
@@ -358,8 +359,18 @@ def test_streams_are_apart_and_close_their_worlds(served) -> None:
     two.reset(1)
     one.step()
     assert two.step().observations[0, 0, 1] == 1
+    one.reset(3)
+    assert [env.closed for env in made] == [0, 1, 0]
     one.close()
     assert [env.closed for env in made] == [1, 1, 0]
+
+
+def test_the_head_of_the_answer_comes_before_a_request(run) -> None:
+    stream = run(Line)
+    asking = threading.Thread(target=stream.replies.initial_metadata, daemon=True)
+    asking.start()
+    asking.join(timeout=10)
+    assert not asking.is_alive()
 
 
 def test_finds_out_that_seeds_do_not_settle_an_episode(run) -> None:
@@ -459,7 +470,7 @@ def test_a_slow_environment_plays_less_before_it_describes_itself(run, monkeypat
     for worlds in (None, 1):
         steps = 0
         assert run(Slow, worlds=worlds).description.deterministic
-        assert 4 < steps < 60
+        assert 0 < steps < 150
 
 
 def test_success_needs_every_agent_that_says_something(run) -> None:

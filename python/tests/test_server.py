@@ -157,6 +157,7 @@ def test_two_on_one_port(launch) -> None:
             ["environments:Line", "--address", "0.0.0.0:0"],
             "magex: address: 0.0.0.0:0 can be reached from outside; give tls_certificate, tls_key and token, or insecure=True",
         ),
+        (["builtins:object"], "magex: make: returned <object object at"),
         (["environments:spaces"], "magex: make: "),
         (["environments:Line", "--token-file", "/absent"], "magex: --token-file: cannot read /absent"),
     ],
@@ -165,7 +166,8 @@ def test_refuses_in_one_line(launch, arguments: list[str], said: str) -> None:
     process = launch("-m", "magex.serve", *arguments)
     assert process.wait(timeout=20) == 1
     error = process.stderr.read()
-    assert error.startswith(said) and error.count("\n") == 1
+    # On a busy machine gRPC itself may add a line when it ends.
+    assert error.startswith(said) and "Traceback" not in error
 
 
 def test_a_path_that_is_too_long(launch, tmp_path: Path) -> None:
