@@ -36,15 +36,12 @@ class Hangs(Line):
 """
 
 
-def hear_interrupts() -> None:
-    """A shell that runs the tests in the background has told them to ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @pytest.fixture
 def launch() -> Iterator[Callable[..., subprocess.Popen]]:
     """launch(arguments of Python, ...) starts a process that ends with the test."""
     processes: list[subprocess.Popen] = []
+    # A shell that runs the tests in the background makes them ignore Ctrl-C, and what they start.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def start(*arguments: str, socket: Path | None = None, **variables: str) -> subprocess.Popen:
         env = {**os.environ, "PYTHONPATH": f"{HERE}:{os.environ.get('PYTHONPATH', '')}"}
@@ -55,11 +52,12 @@ def launch() -> Iterator[Callable[..., subprocess.Popen]]:
         env.update(variables)
         pipe = subprocess.PIPE
         command = [sys.executable, *arguments]
-        process = subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, stderr=pipe, text=True, preexec_fn=hear_interrupts)
+        process = subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
         processes.append(process)
         return processes[-1]
 
     yield start
+    signal.signal(signal.SIGINT, before)
     for process in processes:
         process.kill()
         process.wait()
