@@ -4,9 +4,15 @@ import magex
 magex.serve(make)      # make() returns a PettingZoo Parallel environment, a Gymnasium environment or a VectorEnvironment
 """
 
-from magex._random import uniform
-from magex._server import serve
-from magex._vector import VectorEnvironment
+import os
+
+# gRPC's handlers of fork() break processes that an environment forks, such as the workers of Gymnasium's AsyncVectorEnv. These
+# never call gRPC. It is read when gRPC is imported.
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
+
+from magex._random import uniform  # noqa: E402
+from magex._server import serve  # noqa: E402
+from magex._vector import VectorEnvironment  # noqa: E402
 
 __version__ = "0.2.0"
 

@@ -72,7 +72,7 @@ class _Player:
         self.layout = layout
         self.report = report
         self.index = {agent: i for i, agent in enumerate(layout.agents)}
-        self.state_width = layout.state_width
+        self.state_width = layout.state_seen
         self.lasted: list[tuple[int, bool, bool]] = []
         # The last observations, and what they were when they were returned.
         self.returned: list[tuple[str, str, Any, Any]] = []
@@ -84,7 +84,7 @@ class _Player:
         report.check("after the end", "aliasing", "actions", "other seed")
         if self.layout.masks:
             report.check("masks")
-        if self.layout.state_width:
+        if self.state_width:
             report.check("state")
         if self.layout.steps_max:
             report.check("limits")
@@ -352,15 +352,20 @@ class _Player:
         if not width:
             self._no_state(env, where)
             return
+        wrong = ""
         try:
             state = np.asarray(env.state())
+            if state.size != width:
+                wrong = f"state() has {state.size} numbers, and {width} after the first reset"
+            elif state.dtype.kind not in "biuf" or not np.isfinite(state).all():
+                wrong = "state() has something that is no finite number"
         except Exception as error:
-            self.report.add("state", f"{where}: state(): {describe(error)}; repair it, or serve with state=False")
-            return
-        if state.size != width:
-            self.report.add("state", f"{where}: state() has {state.size} numbers, and {width} after the first reset")
-        elif state.dtype.kind not in "biuf" or not np.isfinite(state).all():
-            self.report.add("state", f"{where}: state() has something that is no finite number")
+            wrong = f"state(): {describe(error)}"
+        if wrong:
+            # Found before, and not sent: training works without.
+            unsent = not self.layout.state_width
+            remedy = "it is not sent: the critic sees all observations" if unsent else "repair it, or serve with state=False"
+            self.report.add("state", f"{where}: {wrong}; {remedy}", warning=unsent)
 
     def _no_state(self, env: Any, where: str) -> None:
         if not where.startswith("episode 1 ") or not where.endswith("reset") or not hasattr(env, "state"):

@@ -125,7 +125,7 @@ class Environment:
         if any(info_masks):
             found.info_masks = info_masks
             found.__post_init__()
-        found.state_width = _state_width(env) if self.state else 0
+        found.state_width = found.state_seen = _state_width(env) if self.state else 0
         return found
 
     def _read_vector(self, env: VectorEnvironment) -> Layout:
@@ -166,7 +166,7 @@ class Environment:
             shape = np.shape(states)
             if len(shape) != 2:
                 raise broke(0, None, "states()", "shape (W, S)", f"shape {shape}")
-            found.state_width = shape[1]
+            found.state_width = found.state_seen = int(shape[1])
         return found
 
 

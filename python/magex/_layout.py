@@ -22,6 +22,8 @@ class Layout:
     observations: list[ObservationCodec]
     actions: ActionTable
     state_width: int = 0
+    # Numbers of the first state(), also if it is not sent because it failed later.
+    state_seen: int = 0
     steps_max: int = 0
     renders: bool = False
     worlds_max: int = 0

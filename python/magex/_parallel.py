@@ -15,7 +15,7 @@ import numpy as np
 
 from magex._layout import Batch, Layout
 from magex._observations import Unfit
-from magex._problems import Problem, StateProblem, broke, names, raised, short
+from magex._problems import Problem, broke, names, raised, short, state_problem
 
 
 class Alone:
@@ -318,7 +318,7 @@ class ParallelWorlds:
             if flat.shape != (self.layout.state_width,):
                 raise broke(w, None, "state()", f"{self.layout.state_width} numbers, as after the first reset", flat.size)
         except Problem as problem:
-            raise StateProblem(problem.kind, f"{problem.message}; serve with state=False if it is of no use", w) from problem
+            raise state_problem(problem) from problem
         batch.states[w] = flat
 
     # -- all worlds
@@ -366,7 +366,8 @@ def finite(batch: Batch, layout: Layout) -> None:
         at = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
         agent = None if field == "state()" else layout.agents[at[1]]
         number = f" number {at[-1]}" if field != "reward" else ""
-        raise broke(at[0], agent, f"{field}{number}", "a finite number", short(values[at]))
+        problem = broke(at[0], agent, f"{field}{number}", "a finite number", short(values[at]))
+        raise state_problem(problem) if field == "state()" else problem
     if batch.masks is not None:
         batch.masks &= batch.active[:, :, None, None]
         if layout.own_masks:

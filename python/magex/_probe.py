@@ -40,17 +40,20 @@ def random_actions(layout: Layout, rng: np.random.Generator, masks: np.ndarray |
     return draw.argmax(axis=2)
 
 
-def play(environment: Environment, steps: int = STEPS) -> Found:
+def play(environment: Environment, steps: int = STEPS, drop_state: bool = False) -> Found:
     """Plays two seeds in two fresh worlds side by side, and then each seed in the other world.
 
     Random numbers that worlds share, what an episode leaves behind for the next one and anything drawn without the seed make
     the two episodes of one seed differ.
+
+    drop_state: a state() that fails, where an episode ends for instance, is not sent at all; the critic sees all observations.
     """
     layout = environment.layout()
     try:
         return _play(environment, layout, steps)
     except StateProblem:
-        # A state() that fails where an episode ends, for instance: the critic sees all observations instead.
+        if not drop_state:
+            raise
         layout.state_width = 0
         return _play(environment, layout, steps)
 

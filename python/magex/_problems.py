@@ -69,6 +69,11 @@ def frame(error: BaseException) -> str:
     return f"{chosen[-1].filename}:{chosen[-1].lineno}" if chosen else ""
 
 
+def state_problem(problem: Problem) -> StateProblem:
+    """The same, with its remedy."""
+    return StateProblem(problem.kind, f"{problem.message}; serve with state=False if it is of no use", problem.world)
+
+
 def short(value: object, limit: int = 120) -> str:
     """A value as a person wants to see it in a sentence."""
     if isinstance(value, np.generic):

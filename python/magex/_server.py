@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from concurrent import futures
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import grpc
 
@@ -86,6 +86,8 @@ def start(
         options=[
             ("grpc.max_receive_message_length", MESSAGE_BYTES_MAX),
             ("grpc.max_send_message_length", MESSAGE_BYTES_MAX),
+            # During a long step a caller asks from time to time whether the connection lives. gRPC would take that for an attack.
+            ("grpc.http2.max_ping_strikes", 0),
             # Two environments on one port would share their callers at random.
             ("grpc.so_reuseport", 0),
         ],
@@ -127,6 +129,11 @@ def _end_with_input() -> None:
             pass
     except OSError:
         pass
+    _end()
+
+
+def _end() -> NoReturn:
+    """Ends the process without waiting for a step that may never end."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -153,6 +160,7 @@ def _serve_address(
         server.wait_for_termination()
     except KeyboardInterrupt:
         server.stop(grace=None).wait(1.0)
+        _end()
 
 
 def check_address(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 import threading
@@ -55,7 +56,7 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
                 layout = self.environment.layout()
                 deterministic, successes = self.deterministic, self.successes
                 if deterministic is None or successes is None:
-                    found = _probe.play(self.environment)
+                    found = _probe.play(self.environment, drop_state=True)
                     deterministic = found.deterministic if deterministic is None else deterministic
                     successes = found.successes if successes is None else successes
                 self._description = describe_layout(layout, deterministic, successes)
@@ -78,6 +79,9 @@ class Service(environment_pb2_grpc.EnvironmentServiceServicer):
             stream.worlds.close()
 
     def Check(self, message: pb.CheckRequest, context: grpc.ServicerContext) -> pb.CheckReply:
+        with contextlib.suppress(Exception):
+            # What is decided once is decided before anything is checked. If it cannot be, the check says why.
+            self.description()
         report = _check.check(self.environment, message.seed % 2**30, message.steps, self.deterministic)
         return pb.CheckReply(
             violations=[pb.Violation(rule=one.rule, sentence=one.sentence, warning=one.warning) for one in report.finish()],

@@ -9,7 +9,7 @@ import numpy as np
 
 from magex._layout import Batch, Layout
 from magex._parallel import finite
-from magex._problems import Refused, broke, raised, request, short
+from magex._problems import Problem, Refused, broke, raised, request, short, state_problem
 
 
 class VectorEnvironment:
@@ -302,8 +302,11 @@ class VectorWorlds:
             given = self._array(masks, "masks()", (worlds, count, total))
             batch.masks[:, :, layout.actions.on_wire] &= given != 0
         if batch.states is not None:
-            states = self._call("states", self.env.states)
-            batch.states[:] = self._array(states, "states()", (worlds, layout.state_width))
+            try:
+                states = self._call("states()", self.env.states)
+                batch.states[:] = self._array(states, "states()", (worlds, layout.state_width))
+            except Problem as problem:
+                raise state_problem(problem) from problem
             alive = batch.active.any(axis=1)
             if ended is not None:
                 alive |= ended.any(axis=1)

@@ -86,9 +86,9 @@ def served(tmp_path: Path) -> Iterator[Callable[..., Any]]:
     """served(make, ...) returns a stub."""
     open_things: list[Any] = []
 
-    def serve(make: Callable, deterministic: bool | None = None, **options: Any) -> Any:
+    def serve(make: Callable, deterministic: bool | None = None, successes: bool | None = None, **options: Any) -> Any:
         path = tmp_path / f"socket{len(open_things)}"
-        server, _ = start(Service(Environment(make, **options), deterministic), f"unix:{path}")
+        server, _ = start(Service(Environment(make, **options), deterministic, successes), f"unix:{path}")
         channel = grpc.insecure_channel(f"unix:{path}")
         open_things.extend((channel, server))
         return environment_pb2_grpc.EnvironmentServiceStub(channel)

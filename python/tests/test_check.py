@@ -288,7 +288,7 @@ class Once(Line):
     def __init__(self) -> None:
         super().__init__()
         Once.made += 1
-        if Once.made == 3:
+        if Once.made == 5:
             raise RuntimeError("only one at a time")
 
 
@@ -326,8 +326,6 @@ BROKEN = [
     (WrongMask, "masks", 'step 4, agent "agent_0": action_mask: expected shape (3,), seen shape (2,)'),
     (EmptyMask, "masks", 'step 4, agent "agent_0": action_mask allows no choice'),
     (LostMask, "masks", 'step 4, agent "agent_0": no action_mask, and there was one after the first reset'),
-    (State, "state", "step 4: state() has 2 numbers, and 3 after the first reset"),
-    (NanState, "state", "step 4: state() has something that is no finite number"),
     (Reuses, "aliasing", 'reset, agent "agent_0": the observation was changed by step 1'),
     (Eats, "actions", "are {} after the step"),
     (CannotClose, "make", "close(): RuntimeError: still open ("),
@@ -349,6 +347,8 @@ def test_a_broken_rule_is_found(served, make: Any, rule: str, said: str) -> None
 
 
 REMARKS = [
+    (State, "state", "step 4: state() has 2 numbers, and 3 after the first reset; it is not sent"),
+    (NanState, "state", "step 4: state() has something that is no finite number; it is not sent"),
     (RewardArrays, "rewards", "reward is an array of shape (1,); give float(reward)"),
     (BrokenState, "state", "state(): ValueError: too lazy"),
     (LateChance, "same seed", "two episodes with seed 11 and the same actions differ in observations at step 7"),
@@ -375,6 +375,12 @@ def test_what_the_author_promised_is_a_violation(served) -> None:
 def test_a_reset_of_the_old_kind(served) -> None:
     reply = check(served, OnlyObservations)
     assert "return (observations, infos), two dicts" in sentences(reply, "reset")
+
+
+@pytest.mark.parametrize("make", [State, NanState])
+def test_a_state_that_is_sent_must_be_right(served, make: Any) -> None:
+    reply = check(served, make, deterministic=True, successes=False)
+    assert "step 4: state() has " in sentences(reply, "state") and "serve with state=False" in sentences(reply, "state")
 
 
 def test_what_cannot_be_served_is_a_violation(served) -> None:

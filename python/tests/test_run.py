@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 
 import grpc
@@ -66,7 +67,8 @@ def test_a_restart_may_cut_an_episode(run) -> None:
     stream = run(Line)
     stream.reset(1, 2)
     stream.step()
-    mixed = stream.step(2, restarts={0: 7})
+    # What the world that begins anew was to do does not count.
+    mixed = stream.step(np.array([[[255]] * 3, [[2]] * 3]), restarts={0: 7})
     assert mixed.observations[0, 0, 1] == 0 and mixed.observations[1, 0, 1] == 2
     assert mixed.rewards[0].tolist() == [0, 0, 0] and mixed.rewards[1].all()
 
@@ -202,6 +204,12 @@ class Breaks(Line):
             'world 0, agent "agent_1", observation number 1: expected a finite number, seen nan',
         ),
         (0, {"agent_1": np.zeros(3, np.float32)}, 'agent "agent_1", observation: expected shape (2,), seen shape (3,)'),
+        # Together they have the right number of numbers.
+        (
+            0,
+            {"agent_0": np.zeros(1, np.float32), "agent_1": np.zeros(3, np.float32)},
+            'agent "agent_0", observation: expected shape (2,), seen shape (1,)',
+        ),
         (0, {"agent_1": "high"}, 'agent "agent_1", observation: expected shape (2,), seen shape ()'),
         (
             0,
@@ -351,8 +359,18 @@ def test_streams_are_apart_and_close_their_worlds(served) -> None:
     two.reset(1)
     one.step()
     assert two.step().observations[0, 0, 1] == 1
+    one.reset(3)
+    assert [env.closed for env in made] == [0, 1, 0]
     one.close()
     assert [env.closed for env in made] == [1, 1, 0]
+
+
+def test_the_head_of_the_answer_comes_before_a_request(run) -> None:
+    stream = run(Line)
+    asking = threading.Thread(target=stream.replies.initial_metadata, daemon=True)
+    asking.start()
+    asking.join(timeout=10)
+    assert not asking.is_alive()
 
 
 def test_finds_out_that_seeds_do_not_settle_an_episode(run) -> None:
@@ -452,4 +470,24 @@ def test_a_slow_environment_plays_less_before_it_describes_itself(run, monkeypat
     for worlds in (None, 1):
         steps = 0
         assert run(Slow, worlds=worlds).description.deterministic
-        assert 4 < steps < 60
+        assert 0 < steps < 150
+
+
+def test_success_needs_every_agent_that_says_something(run) -> None:
+    class Says(Line):
+        said = {"agent_0": True, "agent_1": True}
+
+        def info(self, agent: str) -> dict:
+            return {"success": self.said[agent]} if agent in self.said else {}
+
+    # One agent ends before the others.
+    stream = run(lambda: Says(limit=2, leaves={"agent_1": 1}))
+    for Says.said, expected in (
+        ({"agent_0": True, "agent_1": True}, [1]),
+        ({"agent_0": True, "agent_1": False}, [0]),
+        ({"agent_0": False, "agent_1": True}, [0]),
+        ({}, [0]),
+    ):
+        stream.reset(1)
+        assert stream.step().successes == [0]
+        assert stream.step().successes == expected

@@ -244,6 +244,17 @@ def test_masks(run, where: str) -> None:
     assert stream.step(0, restarts={1: 4}).masks.tolist() == [[[1, 1, 0]] * 2, [[1, 0, 1]] * 2]
 
 
+def test_an_agent_that_does_not_act_may_do_nothing(run) -> None:
+    class Leaves(Masked):
+        def __init__(self) -> None:
+            super().__init__("infos")
+            self.leaves = {"agent_1": 1}
+
+    stream = run(Leaves)
+    stream.reset(1)
+    assert stream.step(0).masks.tolist() == [[[1, 1, 1], [0, 0, 0]]]
+
+
 class Nothing(Masked):
     armed: Any = None
 
