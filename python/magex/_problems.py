@@ -8,10 +8,14 @@ import traceback
 
 import numpy as np
 
-from magex._wire.environment_pb2 import EnvironmentProblem
+from magex._wire import environment_pb2 as pb
 
-Kind = EnvironmentProblem.Kind
-RAISED, BROKE_ITS_WORD, REQUEST = EnvironmentProblem.RAISED, EnvironmentProblem.BROKE_ITS_WORD, EnvironmentProblem.REQUEST
+Kind = pb.EnvironmentProblemKind
+RAISED, BROKE_ITS_WORD, REQUEST = (
+    pb.ENVIRONMENT_PROBLEM_KIND_RAISED,
+    pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD,
+    pb.ENVIRONMENT_PROBLEM_KIND_REQUEST,
+)
 
 _HERE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "purelib", "platlib")})

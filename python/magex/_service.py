@@ -119,7 +119,7 @@ class Stream:
             )
         except Exception as error:
             # Nothing of the environment's ends the stream, not even what is handled nowhere else.
-            return pb.EnvironmentReply(problem=pb.EnvironmentProblem(kind=pb.EnvironmentProblem.RAISED, message=describe(error)))
+            return pb.EnvironmentReply(problem=pb.EnvironmentProblem(kind=pb.ENVIRONMENT_PROBLEM_KIND_RAISED, message=describe(error)))
 
     def _reset(self, message: pb.EnvironmentReset) -> Batch:
         seeds = list(message.seeds)
@@ -161,7 +161,7 @@ class Stream:
         try:
             batch = self.worlds.step(actions, restarts)
         except Problem as problem:
-            if problem.kind == pb.EnvironmentProblem.REQUEST:
+            if problem.kind == pb.ENVIRONMENT_PROBLEM_KIND_REQUEST:
                 self.torn = torn
             raise
         self.torn = False

@@ -145,7 +145,7 @@ def test_options_reach_every_reset(run) -> None:
 @pytest.mark.parametrize(("options", "said"), [("[1]", "options: a JSON list; send an object"), ("{", "options: no JSON")])
 def test_options_are_an_object(run, options: str, said: str) -> None:
     problem = run(Line).reset(1, options=options)
-    assert problem.kind == pb.EnvironmentProblem.REQUEST and said in problem.message
+    assert problem.kind == pb.ENVIRONMENT_PROBLEM_KIND_REQUEST and said in problem.message
 
 
 def test_one_agent_of_gymnasium(run) -> None:
@@ -229,7 +229,7 @@ def test_what_breaks_its_word_is_named(run, monkeypatch, field: int, value: obje
     monkeypatch.setattr(Breaks, "armed", True)
     stream.reset(1)
     problem = stream.step()
-    assert problem.kind == pb.EnvironmentProblem.BROKE_ITS_WORD and problem.world == 0
+    assert problem.kind == pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD and problem.world == 0
     assert said in problem.message
     # The stream goes on, but not this episode.
     assert "send a reset first" in stream.step().message
@@ -311,7 +311,7 @@ def test_an_exception_leaves_the_stream_usable(run, monkeypatch) -> None:
     stream.reset(1, 2)
     before = Raises.made
     problem = stream.step(np.array([[[1]] * 3, [[2]] * 3]))
-    assert problem.kind == pb.EnvironmentProblem.RAISED and problem.world == 1
+    assert problem.kind == pb.ENVIRONMENT_PROBLEM_KIND_RAISED and problem.world == 1
     assert problem.message.startswith("world 1, step: ValueError: the wheel came off (") and "test_run.py:" in problem.message
     assert "send a reset first" in stream.step(restarts={1: 3}).message
     # Restarting every world is a reset as well. The world that raised is made anew, the other is not.
@@ -330,7 +330,7 @@ def test_requests_are_checked(run) -> None:
     assert "restarts: world 1; there are 1" in stream.step(restarts={1: 1}).message
     problem = stream.step(3)
     assert problem.message == 'actions: world 0, agent "agent_0", number 0: expected a choice below 3, seen 3'
-    assert problem.kind == pb.EnvironmentProblem.REQUEST
+    assert problem.kind == pb.ENVIRONMENT_PROBLEM_KIND_REQUEST
     stream.worlds = 2
     assert "actions: shape (2, 3, 1); expected (1, 3, 1)" in stream.step().message
     # A mistake of the caller costs no episode.

@@ -100,25 +100,25 @@ class Broken(Many):
         (
             0,
             np.zeros((2, 2)),
-            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD,
             "observations of step: expected numbers of shape (1, 2, 2), seen float64 of shape (2, 2)",
         ),
-        (0, None, pb.EnvironmentProblem.BROKE_ITS_WORD, "seen object of shape ()"),
+        (0, None, pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD, "seen object of shape ()"),
         (
             0,
             np.full((1, 2, 2), np.nan),
-            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD,
             'world 0, agent "left", observation number 0: expected a finite number, seen nan',
         ),
         (
             1,
             np.zeros((1, 3)),
-            pb.EnvironmentProblem.BROKE_ITS_WORD,
+            pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD,
             "rewards: expected numbers of shape (1, 2), seen float64 of shape (1, 3)",
         ),
-        (2, np.full((1, 2), 0.5), pb.EnvironmentProblem.BROKE_ITS_WORD, "terminated: expected True or False, seen float64"),
-        (5, None, pb.EnvironmentProblem.BROKE_ITS_WORD, "step: expected (observations, rewards, terminated, truncated)"),
-        (9, None, pb.EnvironmentProblem.RAISED, "step: KeyError: 'wheel' ("),
+        (2, np.full((1, 2), 0.5), pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD, "terminated: expected True or False, seen float64"),
+        (5, None, pb.ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD, "step: expected (observations, rewards, terminated, truncated)"),
+        (9, None, pb.ENVIRONMENT_PROBLEM_KIND_RAISED, "step: KeyError: 'wheel' ("),
     ],
 )
 def test_what_breaks_its_word_is_named(run, monkeypatch, field: int, value: Any, kind: int, said: str) -> None:

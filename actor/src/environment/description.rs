@@ -46,9 +46,11 @@ pub(super) fn read(description: &EnvironmentDescription) -> Result<ExternalConfi
     Ok(external)
 }
 
-/// The first key in which an environment is not the one of a run; what does not reach a number does not count.
+/// The first key in which an environment is not the one of a run. What does not reach a number does not count, nor what an
+/// environment finds out about itself by playing and may find out otherwise the next time.
 pub(super) fn difference(run: &ExternalConfig, now: &ExternalConfig) -> Option<String> {
-    let alike = ExternalConfig { renders: run.renders, ..now.clone() };
+    let ExternalConfig { renders, deterministic, successes, .. } = *run;
+    let alike = ExternalConfig { renders, deterministic, successes, ..now.clone() };
     let key = run.changed(&alike)?;
     let value = |config: &ExternalConfig| {
         let table = toml::Value::try_from(config).ok()?;

@@ -13,6 +13,7 @@ use std::sync::{Arc, Mutex};
 
 /// Names the socket on which the process listens.
 const SOCKET: &str = "MAGEX_ENVIRONMENT_SOCKET";
+const HASH_SEED: &str = "PYTHONHASHSEED";
 /// Lines of its output that an error quotes.
 const LINES: usize = 12;
 
@@ -39,6 +40,10 @@ impl Process {
         let mut shell = Command::new("/bin/sh");
         // A group of its own: a terminal's Ctrl-C reaches this program alone, and the whole of it can be ended.
         shell.args(["-c", command]).env(SOCKET, &socket).stdin(Stdio::piped()).stdout(to_output).stderr(errors);
+        if std::env::var_os(HASH_SEED).is_none() {
+            // Python would iterate over a set of strings in another order in every process.
+            shell.env(HASH_SEED, "0");
+        }
         let mut child = shell.process_group(0).spawn().map_err(failed)?;
         // Its ends of the pipe are open until then.
         drop(shell);

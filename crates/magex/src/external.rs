@@ -116,7 +116,12 @@ impl Described {
         }
         if let Some(Value::Table(own)) = task.get(&external) {
             let own: ExternalConfig = own.clone().try_into().context("task.external")?;
-            if let Some(key) = own.changed(&ExternalConfig { renders: own.renders, ..self.external.clone() }) {
+            if let Some(key) = own.changed(&ExternalConfig {
+                renders: own.renders,
+                deterministic: own.deterministic,
+                successes: own.successes,
+                ..self.external.clone()
+            }) {
                 return Err(usage(format!(
                     "task.external.{key} is not what the environment says; start the environment that the file was made \
                      for, or remove [task.external]"

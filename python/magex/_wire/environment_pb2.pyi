@@ -7,6 +7,17 @@ from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Map
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class EnvironmentProblemKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ENVIRONMENT_PROBLEM_KIND_UNSPECIFIED: _ClassVar[EnvironmentProblemKind]
+    ENVIRONMENT_PROBLEM_KIND_RAISED: _ClassVar[EnvironmentProblemKind]
+    ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD: _ClassVar[EnvironmentProblemKind]
+    ENVIRONMENT_PROBLEM_KIND_REQUEST: _ClassVar[EnvironmentProblemKind]
+ENVIRONMENT_PROBLEM_KIND_UNSPECIFIED: EnvironmentProblemKind
+ENVIRONMENT_PROBLEM_KIND_RAISED: EnvironmentProblemKind
+ENVIRONMENT_PROBLEM_KIND_BROKE_ITS_WORD: EnvironmentProblemKind
+ENVIRONMENT_PROBLEM_KIND_REQUEST: EnvironmentProblemKind
+
 class DescribeRequest(_message.Message):
     __slots__ = ("protocol",)
     PROTOCOL_FIELD_NUMBER: _ClassVar[int]
@@ -137,23 +148,13 @@ class Picture(_message.Message):
 
 class EnvironmentProblem(_message.Message):
     __slots__ = ("kind", "message", "world")
-    class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
-        __slots__ = ()
-        KIND_UNSPECIFIED: _ClassVar[EnvironmentProblem.Kind]
-        RAISED: _ClassVar[EnvironmentProblem.Kind]
-        BROKE_ITS_WORD: _ClassVar[EnvironmentProblem.Kind]
-        REQUEST: _ClassVar[EnvironmentProblem.Kind]
-    KIND_UNSPECIFIED: EnvironmentProblem.Kind
-    RAISED: EnvironmentProblem.Kind
-    BROKE_ITS_WORD: EnvironmentProblem.Kind
-    REQUEST: EnvironmentProblem.Kind
     KIND_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     WORLD_FIELD_NUMBER: _ClassVar[int]
-    kind: EnvironmentProblem.Kind
+    kind: EnvironmentProblemKind
     message: str
     world: int
-    def __init__(self, kind: _Optional[_Union[EnvironmentProblem.Kind, str]] = ..., message: _Optional[str] = ..., world: _Optional[int] = ...) -> None: ...
+    def __init__(self, kind: _Optional[_Union[EnvironmentProblemKind, str]] = ..., message: _Optional[str] = ..., world: _Optional[int] = ...) -> None: ...
 
 class CheckRequest(_message.Message):
     __slots__ = ("seed", "steps")

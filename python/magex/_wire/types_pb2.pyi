@@ -85,7 +85,7 @@ class Shard(_message.Message):
     def __init__(self, kind: _Optional[_Union[ShardKind, str]] = ..., iteration: _Optional[int] = ..., index: _Optional[int] = ..., episodes: _Optional[int] = ..., first_episode: _Optional[int] = ..., version: _Optional[int] = ..., mode: _Optional[_Union[Mode, str]] = ..., eval_set: _Optional[int] = ..., record: bool = ...) -> None: ...
 
 class Shape(_message.Message):
-    __slots__ = ("steps", "episodes", "agents", "bodies", "landmarks", "dims", "goals_per_agent", "action_components", "agent_state")
+    __slots__ = ("steps", "episodes", "agents", "bodies", "landmarks", "dims", "goals_per_agent", "action_components", "agent_state", "world_state", "moves", "masks", "marks")
     STEPS_FIELD_NUMBER: _ClassVar[int]
     EPISODES_FIELD_NUMBER: _ClassVar[int]
     AGENTS_FIELD_NUMBER: _ClassVar[int]
@@ -95,6 +95,10 @@ class Shape(_message.Message):
     GOALS_PER_AGENT_FIELD_NUMBER: _ClassVar[int]
     ACTION_COMPONENTS_FIELD_NUMBER: _ClassVar[int]
     AGENT_STATE_FIELD_NUMBER: _ClassVar[int]
+    WORLD_STATE_FIELD_NUMBER: _ClassVar[int]
+    MOVES_FIELD_NUMBER: _ClassVar[int]
+    MASKS_FIELD_NUMBER: _ClassVar[int]
+    MARKS_FIELD_NUMBER: _ClassVar[int]
     steps: int
     episodes: int
     agents: int
@@ -104,7 +108,11 @@ class Shape(_message.Message):
     goals_per_agent: int
     action_components: int
     agent_state: int
-    def __init__(self, steps: _Optional[int] = ..., episodes: _Optional[int] = ..., agents: _Optional[int] = ..., bodies: _Optional[int] = ..., landmarks: _Optional[int] = ..., dims: _Optional[int] = ..., goals_per_agent: _Optional[int] = ..., action_components: _Optional[int] = ..., agent_state: _Optional[int] = ...) -> None: ...
+    world_state: int
+    moves: int
+    masks: int
+    marks: int
+    def __init__(self, steps: _Optional[int] = ..., episodes: _Optional[int] = ..., agents: _Optional[int] = ..., bodies: _Optional[int] = ..., landmarks: _Optional[int] = ..., dims: _Optional[int] = ..., goals_per_agent: _Optional[int] = ..., action_components: _Optional[int] = ..., agent_state: _Optional[int] = ..., world_state: _Optional[int] = ..., moves: _Optional[int] = ..., masks: _Optional[int] = ..., marks: _Optional[int] = ...) -> None: ...
 
 class NamedArray(_message.Message):
     __slots__ = ("name", "array")
@@ -115,7 +123,7 @@ class NamedArray(_message.Message):
     def __init__(self, name: _Optional[str] = ..., array: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Trajectory(_message.Message):
-    __slots__ = ("shape", "positions", "velocities", "goals", "actions", "log_probs", "rewards", "goal_log_probs", "costs", "exact_costs", "agent_state", "metrics", "statics")
+    __slots__ = ("shape", "positions", "velocities", "goals", "actions", "log_probs", "rewards", "goal_log_probs", "costs", "exact_costs", "agent_state", "metrics", "statics", "moves", "masks", "marks", "world_states")
     SHAPE_FIELD_NUMBER: _ClassVar[int]
     POSITIONS_FIELD_NUMBER: _ClassVar[int]
     VELOCITIES_FIELD_NUMBER: _ClassVar[int]
@@ -129,6 +137,10 @@ class Trajectory(_message.Message):
     AGENT_STATE_FIELD_NUMBER: _ClassVar[int]
     METRICS_FIELD_NUMBER: _ClassVar[int]
     STATICS_FIELD_NUMBER: _ClassVar[int]
+    MOVES_FIELD_NUMBER: _ClassVar[int]
+    MASKS_FIELD_NUMBER: _ClassVar[int]
+    MARKS_FIELD_NUMBER: _ClassVar[int]
+    WORLD_STATES_FIELD_NUMBER: _ClassVar[int]
     shape: Shape
     positions: Array
     velocities: Array
@@ -142,21 +154,27 @@ class Trajectory(_message.Message):
     agent_state: Array
     metrics: Array
     statics: _containers.RepeatedCompositeFieldContainer[NamedArray]
-    def __init__(self, shape: _Optional[_Union[Shape, _Mapping]] = ..., positions: _Optional[_Union[Array, _Mapping]] = ..., velocities: _Optional[_Union[Array, _Mapping]] = ..., goals: _Optional[_Union[Array, _Mapping]] = ..., actions: _Optional[_Union[Array, _Mapping]] = ..., log_probs: _Optional[_Union[Array, _Mapping]] = ..., rewards: _Optional[_Union[Array, _Mapping]] = ..., goal_log_probs: _Optional[_Union[Array, _Mapping]] = ..., costs: _Optional[_Union[Array, _Mapping]] = ..., exact_costs: _Optional[_Union[Array, _Mapping]] = ..., agent_state: _Optional[_Union[Array, _Mapping]] = ..., metrics: _Optional[_Union[Array, _Mapping]] = ..., statics: _Optional[_Iterable[_Union[NamedArray, _Mapping]]] = ...) -> None: ...
+    moves: Array
+    masks: Array
+    marks: Array
+    world_states: Array
+    def __init__(self, shape: _Optional[_Union[Shape, _Mapping]] = ..., positions: _Optional[_Union[Array, _Mapping]] = ..., velocities: _Optional[_Union[Array, _Mapping]] = ..., goals: _Optional[_Union[Array, _Mapping]] = ..., actions: _Optional[_Union[Array, _Mapping]] = ..., log_probs: _Optional[_Union[Array, _Mapping]] = ..., rewards: _Optional[_Union[Array, _Mapping]] = ..., goal_log_probs: _Optional[_Union[Array, _Mapping]] = ..., costs: _Optional[_Union[Array, _Mapping]] = ..., exact_costs: _Optional[_Union[Array, _Mapping]] = ..., agent_state: _Optional[_Union[Array, _Mapping]] = ..., metrics: _Optional[_Union[Array, _Mapping]] = ..., statics: _Optional[_Iterable[_Union[NamedArray, _Mapping]]] = ..., moves: _Optional[_Union[Array, _Mapping]] = ..., masks: _Optional[_Union[Array, _Mapping]] = ..., marks: _Optional[_Union[Array, _Mapping]] = ..., world_states: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Recording(_message.Message):
-    __slots__ = ("shape", "positions", "goals", "agent_state", "statics")
+    __slots__ = ("shape", "positions", "goals", "agent_state", "statics", "pictures")
     SHAPE_FIELD_NUMBER: _ClassVar[int]
     POSITIONS_FIELD_NUMBER: _ClassVar[int]
     GOALS_FIELD_NUMBER: _ClassVar[int]
     AGENT_STATE_FIELD_NUMBER: _ClassVar[int]
     STATICS_FIELD_NUMBER: _ClassVar[int]
+    PICTURES_FIELD_NUMBER: _ClassVar[int]
     shape: Shape
     positions: Array
     goals: Array
     agent_state: Array
     statics: _containers.RepeatedCompositeFieldContainer[NamedArray]
-    def __init__(self, shape: _Optional[_Union[Shape, _Mapping]] = ..., positions: _Optional[_Union[Array, _Mapping]] = ..., goals: _Optional[_Union[Array, _Mapping]] = ..., agent_state: _Optional[_Union[Array, _Mapping]] = ..., statics: _Optional[_Iterable[_Union[NamedArray, _Mapping]]] = ...) -> None: ...
+    pictures: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, shape: _Optional[_Union[Shape, _Mapping]] = ..., positions: _Optional[_Union[Array, _Mapping]] = ..., goals: _Optional[_Union[Array, _Mapping]] = ..., agent_state: _Optional[_Union[Array, _Mapping]] = ..., statics: _Optional[_Iterable[_Union[NamedArray, _Mapping]]] = ..., pictures: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class EvalOutcome(_message.Message):
     __slots__ = ("recording", "metrics")
