@@ -27,22 +27,21 @@ fn hand_made() -> (TaskConfig, Env) {
 
 #[test]
 fn with_positions_first_an_agent_moves_with_the_velocity_of_the_step_before() {
-    let mut task = task(2);
+    let (mut task, _) = hand_made();
     task.integration = Integration::PositionFirst;
-    // mpe2 1.1.1: x += 0.1 v, then v = 0.75 v + 0.1 a, with contacts of the places before the step.
-    let mut spread = env_from_state(&task, &[0.0, 0.0, 0.0, 0.125], &[0.0; 4], &[0.5; 4]).unwrap();
-    let apart = |y: f32| 100.0 * 1e-3 * ((-(y - 0.2) / 1e-3).exp().ln_1p());
-    let (mut x, mut v) = ([0.0f32, 0.125], [0.0f32; 2]);
-    for step in 0..6 {
-        let force =
-            if x[1] - x[0] < 0.25 { apart(x[1] - x[0]).min(100.0 * (0.2 - (x[1] - x[0])).max(0.0) + 0.1) } else { 0.0 };
-        spread.step(&[4, 3], &mut [0.0; 2]).unwrap();
-        x = [x[0] + 0.1 * v[0], x[1] + 0.1 * v[1]];
-        v = [0.75 * v[0] + 0.1 * (-5.0 - force), 0.75 * v[1] + 0.1 * (5.0 + force)];
-        let (p, s) = (spread.positions(), spread.velocities());
-        assert!((p[1] - x[0]).abs() < 1e-4 && (p[3] - x[1]).abs() < 1e-4, "step {step}: {p:?}, {x:?}");
-        assert!((s[1] - v[0]).abs() < 1e-3 && (s[3] - v[1]).abs() < 1e-3, "step {step}: {s:?}, {v:?}");
-    }
+    let start = [0.0, 0.0, 0.125, 0.0, 1.5, 1.5];
+    let mut spread = env_from_state(&task, &start, &[0.0; 6], &[1.0, 0.0, -1.0, 0.0, 1.5, 1.5]).unwrap();
+    spread.set_goals(&[0, 1, 2]).unwrap();
+    // From rest nothing moves yet; the overlap of 0.075 pushes with 7.5, the thrust is 5.
+    spread.step(&[0, 0, 3], &mut [0.0; 3]).unwrap();
+    let near = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
+    let (positions, velocities) = (spread.positions(), spread.velocities());
+    assert!(near(&positions, &start) && near(&velocities, &[-0.75, 0.0, 0.75, 0.0, 0.0, 0.5]), "{velocities:?}");
+    // x += 0.1 v, then v = 0.75 v + 0.1 a with the contact of the places before the step: mpe2 1.1.1.
+    spread.step(&[0, 0, 3], &mut [0.0; 3]).unwrap();
+    let (positions, velocities) = (spread.positions(), spread.velocities());
+    assert!(near(&positions, &[-0.075, 0.0, 0.2, 0.0, 1.5, 1.55]), "{positions:?}");
+    assert!(near(&velocities, &[-1.3125, 0.0, 1.3125, 0.0, 0.0, 0.875]), "{velocities:?}");
 }
 
 #[test]
