@@ -59,6 +59,8 @@ pub const SEED_MAX: u64 = i64::MAX as u64;
 pub const STEPS_MAX: u64 = 1_000_000_000_000;
 /// `run.target_collisions` that asks for nothing.
 pub const COLLISIONS_ANY: f32 = 1000.0;
+/// `run.target_return` that asks for nothing.
+pub const RETURN_ANY: f32 = 1e30;
 /// Limit of the episodes of an iteration.
 const EPISODES_MAX: u32 = 100_000;
 
@@ -77,6 +79,9 @@ section! {
         target_sampled_success: f32 = 0.0, 0.0..=1.0;
         /// Stop only if the greedy evaluation has at most this many collisions per agent and step; 1000 allows any.
         target_collisions: f32 = COLLISIONS_ANY, 0.0..=COLLISIONS_ANY;
+        /// External environments: stop when two consecutive evaluations reach this greedy return of an episode; 1e30 never stops
+        /// early.
+        target_return: f32 = RETURN_ANY, -1e30..=RETURN_ANY;
         /// Evaluate every this many iterations.
         eval_every: u32 = 1, 1..=1_000_000;
         /// Greedy episodes per evaluation while training.
@@ -378,6 +383,10 @@ impl RunConfig {
     /// Checks what an external environment cannot be combined with.
     fn check_external(&self) -> Result<(), FieldError> {
         if self.task.name != TaskName::External {
+            if self.run.target_return != RETURN_ANY {
+                let problem = format!("belongs to external environments; the task is {}; remove it", self.task.name);
+                return Err(FieldError::new("run.target_return", problem));
+            }
             return Ok(());
         }
         let wrong = |key: &str, problem: &str| Err(FieldError::new(key, problem));

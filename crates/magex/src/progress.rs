@@ -6,11 +6,12 @@ mod live;
 use crate::output::{colours, note};
 use columns::{Column, heading, line};
 pub(crate) use live::LiveLine;
-use magex_core::config::{COLLISIONS_ANY, RunConfig, RunSection};
+use magex_core::config::{COLLISIONS_ANY, RETURN_ANY, RunConfig, RunSection};
 use magex_core::metrics_table::{
     ARRIVAL_STEP, COLLISION_RATE, COLLISIONS_PER_AGENT_STEP, COST_RATIO, METRICS, REWARD, SECOND_COST_RATIO,
     SUCCESS_RATE, as_written,
 };
+use magex_core::task::TaskConfig;
 use magex_learner::run_events::RunEvent;
 use magex_runtime::telemetry;
 use serde::Deserialize;
@@ -120,7 +121,7 @@ impl Progress {
         let [bold, plain] = if progress.colours { ["\x1b[1m", "\x1b[0m"] } else { [""; 2] };
         note(format!("{bold}{}{plain}", crate::artifacts::describe(config)));
         note(format!("{title} · {out}"));
-        note(format!("{}\n", until(run)));
+        note(format!("{}\n", until(run, &config.task)));
         progress.live = Some(LiveLine::start(run.max_steps, config.steps_per_iteration()));
         progress
     }
@@ -235,19 +236,27 @@ impl Drop for Progress {
 }
 
 /// What ends the run, in lines for 80 columns.
-fn until(run: &RunSection) -> String {
+fn until(run: &RunSection, task: &TaskConfig) -> String {
     let budget = format!("{} joint steps", crate::output::thousands(run.max_steps as f64));
-    if run.target_success > 1.0 {
-        return format!("ends after {budget}");
+    let success = METRICS[SUCCESS_RATE].applies(task) && run.target_success <= 1.0;
+    let mut goals = Vec::new();
+    if run.target_return < RETURN_ANY {
+        goals.push(format!("return {}{}", run.target_return, if success { " or" } else { "" }));
     }
-    let mut goals = vec![format!("success {}", run.target_success)];
+    if !success {
+        return match goals.first() {
+            Some(goal) => format!("ends with {goal} twice in a row,\nor after {budget}"),
+            None => format!("ends after {budget}"),
+        };
+    }
+    goals.push(format!("success {}", run.target_success));
     if run.target_sampled_success > 0.0 {
         goals.push(format!("sampled {}", run.target_sampled_success));
     }
     if run.target_collisions < COLLISIONS_ANY {
         goals.push(format!("collisions {}", run.target_collisions));
     }
-    format!("ends with {} twice in a row,\nor after {budget}", goals.join(", "))
+    format!("ends with {} twice in a row,\nor after {budget}", goals.join(", ").replace(" or,", " or"))
 }
 
 /// To four decimals, for log lines.
@@ -258,16 +267,20 @@ fn rounded(value: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use magex_core::task::Spawn;
 
     #[test]
     fn what_ends_a_run_is_said_first() {
         let mut run = RunSection { max_steps: 1_000_000, ..RunSection::default() };
-        assert_eq!(until(&run), "ends with success 0.995 twice in a row,\nor after 1,000,000 joint steps");
+        let task = TaskConfig::simple_spread(5, Spawn::Uniform);
+        assert_eq!(until(&run, &task), "ends with success 0.995 twice in a row,\nor after 1,000,000 joint steps");
         (run.target_sampled_success, run.target_collisions) = (0.95, 0.05);
-        let text = until(&run);
+        let text = until(&run, &task);
         assert!(text.starts_with("ends with success 0.995, sampled 0.95, collisions 0.05 twice in a row,\n"));
         assert!(text.lines().all(|line| line.len() <= 80));
         run.target_success = 2.0;
-        assert_eq!(until(&run), "ends after 1,000,000 joint steps");
+        assert_eq!(until(&run, &task), "ends after 1,000,000 joint steps");
+        run.target_return = 475.0;
+        assert_eq!(until(&run, &task), "ends with return 475 twice in a row,\nor after 1,000,000 joint steps");
     }
 }

@@ -1,8 +1,8 @@
 //! What a run trains for.
 
 use crate::report::means::{EvalSummary, IterationMeans};
-use magex_core::config::RunSection;
-use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, SUCCESS_RATE, as_written};
+use magex_core::config::{RETURN_ANY, RunSection};
+use magex_core::metrics_table::{COLLISIONS_PER_AGENT_STEP, EPISODE_RETURN, SUCCESS_RATE, as_written};
 
 /// Whether the weights are what the run trains for.
 pub(super) fn reached(run: &RunSection, episodes: &IterationMeans) -> bool {
@@ -10,6 +10,10 @@ pub(super) fn reached(run: &RunSection, episodes: &IterationMeans) -> bool {
     let written = |target: f32| as_written(target.into());
     let mean = |summary: Option<EvalSummary>, metric: usize| summary.and_then(|summary| summary.means[metric]);
     let (success, sampled) = (mean(episodes.greedy, SUCCESS_RATE), mean(episodes.sampled, SUCCESS_RATE));
+    let reward = mean(episodes.greedy, EPISODE_RETURN);
+    if run.target_return < RETURN_ANY && reward >= Some(written(run.target_return)) {
+        return true;
+    }
     let collisions = mean(episodes.greedy, COLLISIONS_PER_AGENT_STEP).unwrap_or_default();
     success >= Some(written(run.target_success))
         && sampled.unwrap_or_default() >= written(run.target_sampled_success)
@@ -43,6 +47,15 @@ mod tests {
         assert!(!reached(&run, [0.99, 0.06], Some(0.95)));
         assert!(!reached(&run, [0.99, 0.05], Some(0.94)));
         assert!(!reached(&run, [0.99, 0.05], None));
+        // The return of an external environment, which knows no success.
+        run.target_return = -12.5;
+        let mut external = means(0.0, 0.0);
+        (external.means[SUCCESS_RATE], external.means[COLLISIONS_PER_AGENT_STEP]) = (None, None);
+        for (value, enough) in [(-12.5, true), (-12.6, false)] {
+            external.means[EPISODE_RETURN] = Some(value);
+            let episodes = IterationMeans { greedy: Some(external), sampled: None };
+            assert_eq!(super::reached(&run, &episodes), enough);
+        }
         assert!(!super::reached(&run, &IterationMeans { greedy: None, sampled: Some(means(1.0, 0.0)) }));
     }
 }
