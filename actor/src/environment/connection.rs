@@ -10,7 +10,7 @@ use magex_proto::v1::EnvironmentProblemKind as Kind;
 use magex_proto::v1::environment_reply::Reply;
 use magex_proto::v1::environment_request::Request as Body;
 use magex_proto::v1::environment_service_client::EnvironmentServiceClient;
-use magex_runtime::client::{Channel, Settings, connect_local};
+use magex_runtime::client::{Channel, Settings, connect_local, root_of};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
@@ -203,5 +203,10 @@ fn gone(process: Option<&mut Process>, status: &Status) -> EnvironmentError {
         std::thread::sleep(Duration::from_millis(50));
         process.ended()
     });
-    EnvironmentError::Lost(ended.unwrap_or_else(|| format!("{}: {}", status.code(), status.message())))
+    // A failed connection says why in its innermost error only.
+    let reason = match std::error::Error::source(status) {
+        Some(source) => root_of(source),
+        None => status.message().to_owned(),
+    };
+    EnvironmentError::Lost(ended.unwrap_or_else(|| format!("{}: {reason}", status.code())))
 }

@@ -24,6 +24,9 @@ pub(crate) struct EnvironmentArgs {
     pub(crate) environment_timeout: u64,
 }
 
+/// What an actor of ours reads to call an environment elsewhere.
+pub(crate) const VARIABLES: [&str; 3] = ["MAGEX_TLS_CA", "MAGEX_TOKEN_FILE", "MAGEX_TOKEN"];
+
 /// An environment that was found, and what it says about itself.
 #[derive(Debug, Clone)]
 pub(crate) struct Described {
@@ -37,7 +40,8 @@ impl EnvironmentArgs {
     pub(crate) fn source(&self) -> anyhow::Result<Option<EnvironmentSource>> {
         let Some(text) = &self.environment else { return Ok(None) };
         // The token and the CA of a service elsewhere come from the environment variables that every client reads.
-        let client = ClientArgs { tls_ca: std::env::var_os("MAGEX_TLS_CA").map(Into::into), token_file: None };
+        let file = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(Into::into);
+        let client = ClientArgs { tls_ca: file("MAGEX_TLS_CA"), token_file: file("MAGEX_TOKEN_FILE") };
         let settings = client.read(None, false)?;
         let timeout = Duration::from_secs(self.environment_timeout.max(1));
         Ok(Some(EnvironmentSource::new(text, &settings, timeout)?))

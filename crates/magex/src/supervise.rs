@@ -6,6 +6,7 @@
 pub mod service;
 mod watching;
 
+use crate::external::VARIABLES;
 use crate::output::note;
 use crate::progress::Progress;
 use anyhow::Context as _;
@@ -138,7 +139,8 @@ pub(crate) async fn run(
         let mut arguments = vec!["actor", "--name", &name, "--learner", &url, "--threads", &threads];
         arguments.extend(commander_url.iter().flat_map(|url| ["--commander", url]));
         arguments.extend(plan.environment.iter().map(String::as_str));
-        let actor = Service::new(&name, &arguments, logs).unawaited();
+        let variables: &[&str] = if plan.environment.is_empty() { &[] } else { &VARIABLES };
+        let actor = Service::new(&name, &arguments, logs).unawaited().with_variables(variables);
         let first = actor.start().await?;
         services.spawn(keep(actor, first, stop.clone()));
     }

@@ -136,7 +136,7 @@ impl Settings {
 }
 
 /// The innermost error: the outer ones of a transport carry no detail.
-pub(crate) fn root_of(error: &dyn std::error::Error) -> String {
+pub fn root_of(error: &dyn std::error::Error) -> String {
     let mut root = error;
     while let Some(source) = root.source() {
         root = source;

@@ -37,6 +37,8 @@ pub struct Service<'a> {
     log: PathBuf,
     inherit: Option<BorrowedFd<'a>>,
     awaited: bool,
+    /// Variables of ours that it gets, too.
+    variables: &'static [&'static str],
 }
 
 /// One child is started at a time: an inherited descriptor is open to every child that is started meanwhile.
@@ -61,12 +63,24 @@ impl<'a> Service<'a> {
     /// The command line `magex <arguments>`; standard error is appended to `<name>.log` in `logs`.
     pub fn new(name: &str, arguments: &[&str], logs: &Path) -> Self {
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        Self { name: name.to_owned(), arguments, log: logs.join(format!("{name}.log")), inherit: None, awaited: true }
+        Self {
+            name: name.to_owned(),
+            arguments,
+            log: logs.join(format!("{name}.log")),
+            inherit: None,
+            awaited: true,
+            variables: &[],
+        }
     }
 
     /// The service gets this open file under the same number.
     pub fn inherit(self, descriptor: BorrowedFd<'a>) -> Self {
         Self { inherit: Some(descriptor), ..self }
+    }
+
+    /// It gets these variables of the environment, which are otherwise for services that run alone.
+    pub(crate) fn with_variables(self, variables: &'static [&'static str]) -> Self {
+        Self { variables, ..self }
     }
 
     fn spawn(&self, command: &mut Command) -> std::io::Result<Child> {
@@ -91,7 +105,8 @@ impl<'a> Service<'a> {
         let log_start = log.metadata().map_or(0, |meta| meta.len());
         let mut command = Command::new(std::env::current_exe()?);
         // Options in the environment are meant for services that run alone.
-        for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("MAGEX_")) {
+        let own = |name: &str| name.starts_with("MAGEX_") && !self.variables.contains(&name);
+        for (name, _) in std::env::vars_os().filter(|(name, _)| own(&name.to_string_lossy())) {
             command.env_remove(name);
         }
         command
