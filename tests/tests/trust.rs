@@ -132,6 +132,9 @@ fn log_probabilities_that_the_weights_do_not_give_are_kept_in_quarantine() {
         config.executor.recurrent = recurrent;
         let invented = trajectory(|t| t.log_probs.iter_mut().for_each(|x| *x = -1.0 - *x * 0.01));
         survives(&config, "log-probabilities", invented, "log_probs: differs by", "0");
+        // One unit in the last place.
+        let bit = trajectory(|t| t.log_probs.iter_mut().for_each(|x| *x = f32::from_bits(x.to_bits() ^ 1)));
+        survives(&config, "the last bit", bit, "log_probs: differs by", "0");
     }
     let config = small(ExecutorKind::Local, 5, 3);
     let other = trajectory(|t| t.actions.iter_mut().for_each(|action| *action = 4 - *action));

@@ -28,7 +28,7 @@ use crate::train::learned::{Learned, Network};
 use crate::train::stats::UpdateStats;
 use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Result as CandleResult, Tensor, Var};
-use magex_core::config::RunConfig;
+use magex_core::config::{ExecutorKind, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_nets::executor::{self as nets, Model, Part, Policy, Taken};
 use magex_nets::features::{FeatureSpec, Features};
@@ -58,6 +58,8 @@ pub struct Mappo {
     model: Model,
     /// L: steps of a chunk; 1 for networks without memory.
     chunk: usize,
+    /// Largest difference between an actor's log-probabilities and ours: none where acting and evaluating have the same bits.
+    tolerance: f64,
 }
 
 /// Values and memories under the weights that an iteration starts with.
@@ -77,7 +79,9 @@ impl Mappo {
     pub fn new(config: &RunConfig) -> Result<Self> {
         let model = Model::new(config)?;
         let chunk = if model.memory() == 0 { 1 } else { config.mappo.chunk_length };
-        Ok(Self { config: config.clone(), model, chunk })
+        // Its products are candle's, whose bits depend on the size of a batch.
+        let tolerance = if config.executor.kind == ExecutorKind::Attention { LOG_PROB_TOLERANCE } else { 0.0 };
+        Ok(Self { config: config.clone(), model, chunk, tolerance })
     }
 
     /// What the networks see.
@@ -128,7 +132,7 @@ impl Mappo {
             .map(|episode| self.evaluate(&constants, batch, episode))
             .collect::<Result<_>>()?;
         for (episode, evaluation) in evaluations.iter().enumerate() {
-            check_log_probs(episode, evaluation.error)?;
+            self.check_log_probs(episode, evaluation.error)?;
         }
 
         // 2. Advantages and returns in raw units, with the statistics that the values were made under.
@@ -194,7 +198,7 @@ impl Mappo {
                     // The networks are still those that acted.
                     for (slice, (_, sums)) in slices.iter().zip(&policy) {
                         let (error, row) = sums.worst;
-                        check_log_probs(slice.episode_of(row, m.joint_ratio), error)
+                        self.check_log_probs(slice.episode_of(row, m.joint_ratio), error)
                             .inspect_err(|_| *value_norm = statistics)?;
                     }
                 }
@@ -349,6 +353,12 @@ impl Mappo {
         Ok((gradients(networks, variables, &loss)?, sum(&losses)?))
     }
 
+    /// Refuses log-probabilities that the networks do not give.
+    fn check_log_probs(&self, episode: usize, error: f64) -> std::result::Result<(), Suspect> {
+        let limit = self.tolerance;
+        if error <= limit { Ok(()) } else { Err(Suspect { trajectory: episode, field: "log_probs", error, limit }) }
+    }
+
     /// Policy and value function without a gradient.
     fn constants(&self, networks: &[Network]) -> Result<Functions> {
         let constant = |network: &Network| Ok(ParamBuilder::with(network.params.tensors()?));
@@ -409,14 +419,6 @@ fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Res
 /// The larger of an error and |x|; infinite if x is no number.
 fn worse(error: f64, x: f32) -> f64 {
     if x.is_nan() { f64::INFINITY } else { error.max(f64::from(x.abs())) }
-}
-
-/// Refuses log-probabilities that the networks do not give.
-fn check_log_probs(episode: usize, error: f64) -> std::result::Result<(), Suspect> {
-    if error <= LOG_PROB_TOLERANCE {
-        return Ok(());
-    }
-    Err(Suspect { trajectory: episode, field: "log_probs", error, limit: LOG_PROB_TOLERANCE })
 }
 
 /// (A − mean) / (standard deviation + 1e-5) over the samples of agents that act (all, if `active` is empty); 0 for the others.

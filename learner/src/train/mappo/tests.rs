@@ -63,6 +63,7 @@ fn the_gradient_of_the_value_loss_is_its_slope_and_the_loss_is_linear_beyond_del
 
 /// Samples from the logits and keeps what it chose, with its log-probability.
 struct Sampler {
+    heads: magex_nets::distribution::ActionHeads,
     stream: magex_core::rng::Stream,
     actions: Vec<u8>,
     log_probs: Vec<f32>,
@@ -70,15 +71,8 @@ struct Sampler {
 
 impl magex_nets::executor::Chooser for Sampler {
     fn choose(&mut self, row: usize, logits: &[f32]) -> &[u8] {
-        let weights: Vec<f64> = logits.iter().map(|&logit| libm::exp(logit.into())).collect();
-        let mut left = self.stream.range(0.0, weights.iter().sum());
-        let action = weights.iter().position(|weight| {
-            left -= weight;
-            left < 0.0
-        });
-        let action = action.unwrap_or(weights.len() - 1);
-        self.actions[row] = action as u8;
-        self.log_probs[row] = libm::log(weights[action] / weights.iter().sum::<f64>()) as f32;
+        let action = &mut self.actions[row..=row];
+        self.log_probs[row] = self.heads.choose(logits, Some(&mut self.stream), action);
         &self.actions[row..=row]
     }
 }
@@ -122,7 +116,8 @@ fn copies(kind: magex_core::config::ExecutorKind) -> f64 {
         let policy = mappo.model.policy(&mut learned.networks.iter().map(constants).collect::<Vec<_>>()).unwrap();
         let rows = s.episodes * s.agents;
         let stream = Key::new(5, Purpose::Bench, &[iteration]).stream();
-        let mut sampler = Sampler { stream, actions: vec![0; rows], log_probs: vec![0.0; rows] };
+        let heads = mappo.model.heads().clone();
+        let mut sampler = Sampler { heads, stream, actions: vec![0; rows], log_probs: vec![0.0; rows] };
         policy.act(&slice.input(&slice.features(), Vec::new(), GraphNoise::Off), &mut sampler).unwrap();
         (t.actions, t.log_probs) = (sampler.actions, sampler.log_probs);
         t.rewards = t.actions.chunks_exact(2).flat_map(|pair| [0.0, f32::from(u8::from(pair[0] == pair[1]))]).collect();
