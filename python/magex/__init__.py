@@ -10,10 +10,11 @@ import os
 # never call gRPC. It is read when gRPC is imported.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 
+from magex._assignment import Assignment, assign, assign_costs, assign_sparse  # noqa: E402
 from magex._random import uniform  # noqa: E402
 from magex._server import serve  # noqa: E402
 from magex._vector import VectorEnvironment  # noqa: E402
 
 __version__ = "0.2.0"
 
-__all__ = ["VectorEnvironment", "__version__", "serve", "uniform"]
+__all__ = ["Assignment", "VectorEnvironment", "__version__", "assign", "assign_costs", "assign_sparse", "serve", "uniform"]
