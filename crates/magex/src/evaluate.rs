@@ -12,7 +12,7 @@ use magex_actor::rollout::Roller;
 use magex_assign::POWERS;
 use magex_core::config::{Algorithm, CommanderPolicy, RunConfig};
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
-use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn, TaskName};
+use magex_core::task::{AGENTS_MAX, HORIZON_MAX, Spawn, TaskName, TaskSettings};
 use magex_core::trajectory::{EpisodeMetrics, EvalOutcome, Recording, ShardResult};
 use magex_env::Classical;
 use magex_learner::trainer::{EVAL_SET_FINAL, EVAL_SET_TRAINING};
@@ -136,7 +136,13 @@ impl Subject {
             return Err(anyhow::anyhow!("--strict: these are not the weights of a finished run: {notes}"));
         }
         trained.notes.iter().for_each(|text| tracing::warn!("{text}"));
-        let config = self.vary.apply(&trained)?;
+        let mut config = self.vary.apply(&trained)?;
+        // The run may have been trained without pictures, and be looked at with them.
+        if let TaskSettings::External(external) = &mut config.task.settings
+            && let Some(described) = self.environment.describe()?
+        {
+            external.renders = described.renders();
+        }
         Ok((trained, config))
     }
 

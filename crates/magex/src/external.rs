@@ -94,6 +94,11 @@ pub(crate) fn unavailable(error: EnvironmentError) -> anyhow::Error {
 }
 
 impl Described {
+    /// Whether it draws pictures.
+    pub(crate) fn renders(&self) -> bool {
+        self.external.renders
+    }
+
     /// A configuration with the task that the environment is; text that is no TOML stays what it is.
     ///
     /// # Errors
