@@ -207,6 +207,21 @@ fn an_environment_that_is_not_a_function_of_its_seed_is_trained_and_said_to_be_n
 }
 
 #[test]
+fn an_environment_that_only_says_that_it_is_a_function_of_its_seed_is_found_out() {
+    let place = Place::new(&written(3, ""));
+    let environment = format!("{CORRIDOR} impure liar");
+    place.train(&environment, "run", &[]);
+    let mut cluster = Cluster::start(&config(&place.path("run")));
+    cluster.start_actor_with(&["--environment", &environment]);
+    cluster.start_actor_with(&["--environment", &environment]);
+    let (status, log) = (cluster.learner.wait(), cluster.learner.log());
+    assert!(!status.success() && log.contains("serve(deterministic=False)"), "{log}");
+    let checked = place.magex(&["check-environment", "--environment", &environment]);
+    let told = String::from_utf8_lossy(&checked.stdout).into_owned();
+    assert!(checked.status.code() == Some(1) && told.contains("in another process step"), "{told}");
+}
+
+#[test]
 fn an_actor_without_the_environment_says_so() {
     let place = Place::new(&written(2, ""));
     place.train(CORRIDOR, "run", &[]);

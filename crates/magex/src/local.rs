@@ -74,6 +74,13 @@ pub fn commander(
 pub(crate) fn judge(config: &RunConfig) -> Compute {
     let (config, mut loaded) = (config.clone(), None::<(String, LoadedPolicy)>);
     Box::new(move |shard, weights| {
+        if let Ok(external) = config.task.external() {
+            return Err(format!(
+                "this host has no {}; if no actor is to blame, the environment is not a function of its seed: with \
+                 serve(deterministic=False) its runs are not checked",
+                external.environment
+            ));
+        }
         let policy = match loaded.take() {
             Some((sha256, policy)) if sha256 == weights.sha256 => policy,
             _ => LoadedPolicy::new(&config, &weights.bytes, None).map_err(|error| error.to_string())?,
