@@ -26,8 +26,10 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 
-/// Agents of a step, all teams together, that are acted for on the thread of the call: well under a millisecond.
+/// Agents of a step, all teams together, and pairs of them that are acted for on the thread of the call: about a millisecond
+/// where the graph has an edge for every pair. Longer ones would delay the thread's other calls, checks of the health too.
 const SMALL: usize = 256;
+const SMALL_PAIRS: usize = 10_000;
 
 /// Implements the service.
 #[derive(Clone)]
@@ -82,13 +84,13 @@ impl PolicyApi {
             let problem = format!("{agents} agents, all teams together, exceed the limit of {}", self.agents);
             return Err(status::invalid_argument(format!("{path}positions"), problem));
         }
-        let each = agents / (request.teams as usize).max(1);
+        // The graph of a team has an edge for every pair.
+        let pairs = agents * (agents / (request.teams as usize).max(1)).max(1);
         let work = Work { request, key, model, choice: Choice { mode, seed }, path: path.to_owned() };
-        let response = if agents <= SMALL {
+        let response = if agents <= SMALL && pairs <= SMALL_PAIRS {
             work.run()?
         } else {
-            // The graph of a team has an edge for every pair.
-            let places = self.answering.places(agents * each.max(1), budget.left()).await?;
+            let places = self.answering.places(pairs, budget.left()).await?;
             let working = tokio::task::spawn_blocking(move || {
                 let _places = places;
                 work.run()

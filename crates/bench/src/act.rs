@@ -1,5 +1,6 @@
 //! `act`: the policy as a service process: latency of one client, calls per second of eight.
 
+use crate::flood::flood;
 use crate::report::Report;
 use crate::runs::Keep;
 use crate::stats::quantile;
@@ -37,6 +38,9 @@ pub(crate) struct ActArgs {
     /// Seconds of each throughput row.
     #[arg(long, value_name = "S", default_value_t = 5, value_parser = settings::count)]
     seconds: u32,
+    /// Seconds of each flood by 64 clients.
+    #[arg(long, value_name = "S", default_value_t = 10, value_parser = settings::count)]
+    flood: u32,
 }
 
 pub(crate) fn act(args: &ActArgs) -> anyhow::Result<Report> {
@@ -95,6 +99,16 @@ fn rows(report: &mut Report, args: &ActArgs, config: &RunConfig, place: &std::pa
     row(what, format!("{p50:.3} / {p99:.3} ms"), "1 / 5 ms", "0.3 / 1 ms", value);
     let what = format!("Act, {name}, N = {n}, {CLIENTS} clients");
     row(what, format!("{}/s", thousands(rate)), "3,000/s", "10,000/s", json!({ "calls_per_s": rate }));
+    // A team as trained, and one whose calls do not stay on the thread that accepts others.
+    for n in [n, 256] {
+        let steps: Vec<v1::ActRequest> = (0..16).map(|k| step(config, n, k)).collect();
+        let call = move |channel, number: usize| {
+            let (mut client, request) = (PolicyServiceClient::new(channel), steps[number % steps.len()].clone());
+            async move { client.act(request).await.map(drop) }
+        };
+        let what = format!("Act, {name}, N = {n}");
+        many.block_on(flood(&url, service.id(), args.flood, call))?.report(report, &what, args.flood);
+    }
     many.block_on(service.stop());
     Ok(())
 }
@@ -105,13 +119,12 @@ async fn connect(url: &str) -> anyhow::Result<PolicyServiceClient<Channel>> {
 }
 
 /// The first step of a team that is anywhere on the map.
-fn step(config: &RunConfig, index: u32) -> v1::ActRequest {
+fn step(config: &RunConfig, n: usize, index: u32) -> v1::ActRequest {
     let task = &config.task;
     let mut stream = Key::new(5, Purpose::Bench, &[index]).stream();
     let half = f64::from(task.side / 2.0);
-    let mut within = |limit: f64, width: usize| -> Vec<f32> {
-        (0..task.agents * width).map(|_| stream.range(-limit, limit) as f32).collect()
-    };
+    let mut within =
+        |limit: f64, width: usize| -> Vec<f32> { (0..n * width).map(|_| stream.range(-limit, limit) as f32).collect() };
     let (d, balls) = (task.dims(), if task.balls() > 0 { task.dims() } else { 0 });
     v1::ActRequest {
         dims: d as u32,
@@ -120,7 +133,7 @@ fn step(config: &RunConfig, index: u32) -> v1::ActRequest {
         goals: within(half, d),
         balls: within(half, balls),
         ball_velocities: within(1.0, balls),
-        agent_state: vec![0.0; task.agents * task.agent_state()],
+        agent_state: vec![0.0; n * task.agent_state()],
         ..Default::default()
     }
 }
@@ -128,7 +141,7 @@ fn step(config: &RunConfig, index: u32) -> v1::ActRequest {
 /// Median and 99th percentile of the round trip, milliseconds; the memory goes on from call to call.
 async fn one_client(url: &str, config: &RunConfig, calls: u32) -> anyhow::Result<[f64; 2]> {
     let mut client = connect(url).await?;
-    let steps: Vec<v1::ActRequest> = (0..64).map(|k| step(config, k)).collect();
+    let steps: Vec<v1::ActRequest> = (0..64).map(|k| step(config, config.task.agents, k)).collect();
     let (mut times, mut memory) = (Vec::new(), Default::default());
     // The first calls find cold caches.
     for call in 0..100 + calls {
@@ -149,7 +162,7 @@ async fn saturate(url: &str, config: &RunConfig, seconds: u32) -> anyhow::Result
     let until = start + Duration::from_secs(seconds.into());
     let mut tasks = Vec::new();
     for k in 0..CLIENTS {
-        let (mut client, first) = (connect(url).await?, step(config, k as u32));
+        let (mut client, first) = (connect(url).await?, step(config, config.task.agents, k as u32));
         tasks.push(tokio::spawn(async move {
             let (mut calls, mut memory) = (0u64, Default::default());
             while Instant::now() < until {

@@ -2,13 +2,14 @@
 
 mod load;
 
+use crate::flood::flood;
 use crate::goals::learned_ratio;
 use crate::report::Report;
 use crate::runs::Keep;
 use crate::solver::limits::limits;
 use crate::solver::{distances, time_exact, uniform_points};
 use crate::vitals::memory_mib;
-use load::{Flood, flood, one_client, saturate};
+use load::{one_client, saturate};
 use magex::folder;
 use magex::output::{note, thousands};
 use magex::settings;
@@ -18,6 +19,7 @@ use magex_core::config::{CommanderConfig, CommanderPolicy, RunConfig};
 use magex_nets::commander::Commander;
 use magex_nets::weights_file;
 use magex_proto::v1;
+use magex_proto::v1::commander_service_client::CommanderServiceClient;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -209,20 +211,12 @@ fn service_rows(report: &mut Report, args: &AssignArgs, folder: &Path) -> anyhow
         row(report, &what, format!("{}/s", thousands(rate)), must[1], aim[1], json!({ "calls_per_s": rate }));
     }
     let teams: Vec<v1::AssignRequest> = (0..64).map(|k| team(TEAM, k, v1::AssignmentMethod::Exact)).collect();
-    let Flood { answered, exhausted, wrong, health_p99, memory } =
-        many.block_on(flood(&url, service.id(), &teams, args.flood))?;
-    let [begin, middle, end] = memory;
-    let text = format!(
-        "{} answers, {} RESOURCE_EXHAUSTED, {} other errors; {begin:.0} → {middle:.0} → {end:.0} MiB; health p99 {health_p99:.1} ms",
-        thousands(answered as f64),
-        thousands(exhausted as f64),
-        wrong
-    );
-    let value = json!({
-        "answered": answered, "exhausted": exhausted, "wrong": wrong, "health_p99_ms": health_p99, "mib": memory,
-    });
-    report.failed |= wrong > 0;
-    row(report, &format!("64 clients for {} s", args.flood), text, "0 others, flat, 25 ms", "", value);
+    let assign = move |channel, number: usize| {
+        let (mut client, request) = (CommanderServiceClient::new(channel), teams[number % teams.len()].clone());
+        async move { client.assign(request).await.map(drop) }
+    };
+    let what = format!("Assign EXACT, {TEAM} × {TEAM}");
+    many.block_on(flood(&url, service.id(), args.flood, assign))?.report(report, &what, args.flood);
     many.block_on(service.stop());
     let mut service = many.block_on(Service::new("commander", &arguments[..3], folder).start())?;
     let url = format!("http://{}", service.address);

@@ -10,6 +10,7 @@ mod cluster;
 mod endless;
 mod env;
 mod fleet;
+mod flood;
 mod goals;
 mod messages;
 mod powers;
