@@ -164,12 +164,23 @@ pub enum CanonicalOrder {
     Hilbert,
 }
 
+/// What the learned scheduler's PPO is rewarded for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CommanderObjective {
+    /// R_c = 1 − C_c / C_h of the decision (paper, eq. 4): known before the episode is played.
+    Distance,
+    /// The last arrival and the contacts that were measured in the episode.
+    Arrival,
+}
+
 section! {
     /// `[commander]`
     CommanderConfig {
         /// Goal scheduler.
         kind: CommanderPolicy = CommanderPolicy::Pairwise;
-        /// Exponent of the distances that the `exact` and `makespan` schedulers sum; 1 for the others.
+        /// Exponent of the distances that the `exact` and `makespan` schedulers sum, and that `pairwise` with the objective
+        /// `arrival` compares; 1 for the others.
         power: f64 = 1.0, 1.0..=16.0;
         /// Hidden units per layer of the scheduler's network.
         hidden: usize = 32, 4..=1024;
@@ -177,6 +188,10 @@ section! {
         order: CanonicalOrder = CanonicalOrder::Angle;
         /// Share of the training episodes whose goals are a random matching, whatever the scheduler: agents meet more often.
         random_assignment_fraction: f32 = 0.0, 0.0..=1.0;
+        /// What the learned kinds are rewarded for.
+        objective: CommanderObjective = CommanderObjective::Distance;
+        /// Price of one contact per agent and step, as a share of the horizon, when the objective is the arrival.
+        contact_cost: f32 = 1.0, 0.0..=1000.0;
         /// Adam's step size.
         learning_rate: f64 = 1e-3, 0.0..=1.0;
         /// PPO epochs over the iteration's episodes.
@@ -345,10 +360,22 @@ impl RunConfig {
             return Err(FieldError::new("task.reward_target", problem));
         }
         self.commander.check_ranges("commander")?;
-        let CommanderConfig { kind, power, .. } = self.commander;
-        if power != 1.0 && !kind.knows_power() {
+        let CommanderConfig { kind, power, objective, contact_cost, .. } = self.commander;
+        if objective != CommanderObjective::Distance && !kind.learned() {
+            let problem =
+                format!("the {kind} scheduler does not learn; remove it, or use commander.kind = \"pairwise\"");
+            return Err(FieldError::new("commander.objective", problem));
+        }
+        if objective == CommanderObjective::Distance && contact_cost != CommanderConfig::default().contact_cost {
+            let problem = "counts only with commander.objective = \"arrival\"; remove it, or set that";
+            return Err(FieldError::new("commander.contact_cost", problem));
+        }
+        // The objective of the distance would lead the pairwise scheduler back to the power 1.
+        let arriving = kind == CommanderPolicy::Pairwise && objective == CommanderObjective::Arrival;
+        if power != 1.0 && !kind.knows_power() && !arriving {
             let problem = format!(
-                "{power}, but the {kind} scheduler has no power; use 1, or commander.kind = \"exact\" or \"makespan\""
+                "{power}, but the {kind} scheduler has no power; use 1, commander.kind = \"exact\" or \"makespan\", or \
+                 \"pairwise\" with commander.objective = \"arrival\""
             );
             return Err(FieldError::new("commander.power", problem));
         }

@@ -185,7 +185,7 @@ impl Commander {
     /// What the network sees of a team.
     pub fn instance(&self, team: &Team<'_>) -> Result<Instance, CommanderError> {
         match &self.net {
-            Some(Net::Pairwise(_)) => pairwise::instance(team),
+            Some(Net::Pairwise(_)) => pairwise::instance(team, self.power),
             Some(Net::Ranking(net)) => net.instance(team),
             None => Err(CommanderError::Instance(format!("the {} scheduler has no network", self.kind))),
         }

@@ -6,7 +6,7 @@ pub mod systems;
 use crate::plots::{self, LOG_FROM, Plot};
 use axis::{Axis, labels, limits, short_count, ticks};
 use magex_core::error::FieldError;
-use magex_core::metrics_table::{Kind, Look, Scale};
+use magex_core::metrics_table::{EPISODE_RETURN, Kind, Look, METRICS, Scale};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::fmt::Write as _;
@@ -68,14 +68,15 @@ struct Curve {
 
 impl Panel {
     /// The panel of a plot, if the run has what it shows.
-    fn of(plot: Plot, lines: &[MetricsLine]) -> Option<Self> {
+    fn of(plot: Plot, lines: &[MetricsLine], external: bool) -> Option<Self> {
         let curves: Vec<Curve> =
             plot.series.iter().map(|one| Curve { look: one.kind.look(), points: points(lines, one.place) }).collect();
         let mut panel = Self { plot, curves, log: false };
         let values = panel.values();
         let (low, high) = values.iter().fold((f64::INFINITY, 0.0), |(low, high), &y| (y.min(low), y.max(high)));
         panel.log = panel.plot.log && low > 0.0 && high > LOG_FROM * low;
-        (panel.plot.always || values.iter().any(|&value| value != 0.0)).then_some(panel)
+        let always = panel.plot.always && !external;
+        (always || values.iter().any(|&value| value != 0.0)).then_some(panel)
     }
 
     fn values(&self) -> Vec<f64> {
@@ -117,11 +118,15 @@ const DIGIT: f64 = 8.0;
 pub fn curve_svg(title: &str, subtitle: &str, lines: &[MetricsLine]) -> Result<String, FieldError> {
     let last = lines.last().ok_or_else(empty)?.joint_env_steps.max(1) as f64;
     let plots = plots::all().into_iter().filter(|plot| plot.picture);
-    let panels = plots.filter_map(|plot| Panel::of(plot, lines));
+    // An environment of the user's own has a return, and what the simulated tasks always have only by chance.
+    let external = lines.iter().any(|line| line.get(METRICS[EPISODE_RETURN].name).is_some());
+    let panels = plots.filter_map(|plot| Panel::of(plot, lines, external));
     let (constant, panels): (Vec<_>, Vec<_>) = panels.partition(|panel| panel.in_a_word().is_some());
     let mut svg = Svg { body: String::new(), last };
     let mut top = HEADER;
-    let (large, small): (Vec<_>, Vec<_>) = panels.iter().partition(|panel| panel.plot.scale == Scale::Share);
+    let main =
+        |plot: &Plot| if external { plot.id == METRICS[EPISODE_RETURN].name } else { plot.scale == Scale::Share };
+    let (large, small): (Vec<_>, Vec<_>) = panels.iter().partition(|panel| main(&panel.plot));
     for panel in large {
         svg.panel(panel, [MARGIN, WIDTH - MARGIN], top, LARGE);
         top += TITLE + LARGE + AXIS;

@@ -128,7 +128,8 @@ impl LivePage {
         // As it was written; null if the run does not end with it.
         let target = |value: f32, asked: bool| (asked && run.target_success <= 1.0).then(|| as_written(value.into()));
         let words = json!({
-            "name": task.name.to_string(), "agents": task.agents, "spawn": task.spawn.to_string(),
+            "name": task.name.to_string(),
+            "environment": task.external().ok().map(|external| &external.environment), "agents": task.agents, "spawn": task.spawn.to_string(),
             "horizon": task.horizon, "executor": config.executor.kind.to_string(),
             "scheduler": config.commander.kind.to_string(), "seed": run.seed, "max_steps": run.max_steps,
             "target_success": target(run.target_success, run.target_success <= 1.0),

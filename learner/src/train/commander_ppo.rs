@@ -1,9 +1,13 @@
 //! PPO for the goal commander: one decision per episode and stage, reward R_c = 1 − C_c / C_h (paper, eq. 4), known as soon as
-//! the decision is made.
+//! the decision is made. The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic
+//! is needed.
 //!
-//! The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic is needed. The
+//! With the objective [`arrival`], the reward is what was measured in the episode instead, the same for all its stages. The
 //! surrogate is clipped pick by pick: the ratio of a whole 50-agent decision would leave the clip range at once.
 
+mod arrival;
+#[cfg(test)]
+mod arrival_tests;
 mod imitation;
 #[cfg(test)]
 mod tests;
@@ -13,7 +17,7 @@ use crate::train::learned::{Learned, Network};
 use crate::train::mappo::clipped_surrogate;
 use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Tensor, Var};
-use magex_core::config::CommanderConfig;
+use magex_core::config::{CommanderConfig, CommanderObjective};
 use magex_core::joint_state::group_positions;
 use magex_core::keys::random_goals;
 use magex_core::rng::{Key, Purpose};
@@ -36,7 +40,7 @@ pub struct Sample {
     pub instance: Instance,
     /// What was decided, in the order of the picks.
     pub picks: Vec<Pick>,
-    /// R_c of the decision minus R_c of the greedy decision.
+    /// R_c of the decision minus R_c of the greedy decision; or the measured reward minus its forecast.
     pub advantage: f32,
 }
 
@@ -61,6 +65,7 @@ pub struct CommanderPpo {
     config: CommanderConfig,
     agents: usize,
     dims: usize,
+    horizon: u32,
     stages: &'static [Stage],
     seed: u64,
 }
@@ -68,7 +73,8 @@ pub struct CommanderPpo {
 impl CommanderPpo {
     /// For the teams of a task.
     pub fn new(config: &CommanderConfig, task: &TaskConfig, seed: u64) -> Self {
-        Self { config: config.clone(), agents: task.agents, dims: task.dims(), stages: task.stages(), seed }
+        let TaskConfig { agents, horizon, .. } = *task;
+        Self { config: config.clone(), agents, dims: task.dims(), horizon, stages: task.stages(), seed }
     }
 
     /// Initial network and optimiser; without parameters if the scheduler is not learned.
@@ -99,6 +105,9 @@ impl CommanderPpo {
         let commander = self.commander(network)?;
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
+        // Of every episode: what was measured, and what was known of its instances before the decisions.
+        let (mut rewards, mut known) = (Vec::new(), Vec::<Vec<f64>>::new());
+        let mut episode_of_sample = Vec::new();
         for (trajectory, t) in trajectories.iter().enumerate() {
             let (stages, points) = (self.stages.len(), (&*t.positions, t.statics.get(LANDMARKS)));
             for b in 0..t.shape.episodes {
@@ -106,6 +115,8 @@ impl CommanderPpo {
                     // The scheduler had no say in this episode.
                     continue;
                 }
+                rewards.push(arrival::reward(&t.metrics[b], self.horizon, self.config.contact_cost));
+                known.push(Vec::new());
                 for (k, stage) in self.stages.iter().enumerate() {
                     let team = Team {
                         agents: group_positions(&t.shape, points, stage.from, b),
@@ -117,7 +128,11 @@ impl CommanderPpo {
                         CommanderError::Instance(format!("the goals of stage {k} of episode {b} are not one-to-one"))
                     })?;
                     let at = b * stages + k;
-                    let greedy = greedy_cost(&commander, &instance, &team)?;
+                    let greedy_goals = greedy_goals(&commander, &instance)?;
+                    let greedy = cost(&team, &greedy_goals);
+                    if let Some(known) = known.last_mut() {
+                        known.extend([greedy, arrival::longest(&team, &greedy_goals)]);
+                    }
                     let exact = f64::from(t.exact_costs[at]).max(1e-9);
                     let advantage = (greedy - f64::from(t.costs[at])) / exact;
                     if !(advantage as f32).is_finite() {
@@ -134,9 +149,19 @@ impl CommanderPpo {
                         return Err(Suspect { trajectory, field, error: difference, limit }.into());
                     }
                     error = error.max(difference);
+                    episode_of_sample.push(rewards.len() - 1);
                     samples.push(Sample { instance, picks, advantage: advantage as f32 });
                 }
             }
+        }
+        if self.config.objective == CommanderObjective::Arrival {
+            let advantages = arrival::advantages(&rewards, &known);
+            for (sample, &episode) in samples.iter_mut().zip(&episode_of_sample) {
+                sample.advantage = advantages[episode] as f32;
+            }
+            let all = samples.len();
+            samples.retain(|sample| sample.advantage.is_finite());
+            skipped += (all - samples.len()) as f64;
         }
         if samples.is_empty() {
             return Ok(CommanderStats { skipped, ..CommanderStats::default() });
@@ -249,10 +274,15 @@ pub(crate) fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Ve
     Some(goals)
 }
 
+/// The most likely decision.
+fn greedy_goals(commander: &Commander, instance: &Instance) -> Result<Vec<u32>, CommanderError> {
+    let scores = commander.scores(from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
+    Ok(instance.decide(&scores, None).0.goals)
+}
+
 /// C of the most likely decision.
 pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) -> Result<f64, CommanderError> {
-    let scores = commander.scores(from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
-    Ok(cost(team, &instance.decide(&scores, None).0.goals))
+    Ok(cost(team, &greedy_goals(commander, instance)?))
 }
 
 /// C: summed distance of an assignment, in double precision; agents without a goal cost nothing.

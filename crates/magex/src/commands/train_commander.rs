@@ -12,7 +12,7 @@ use crate::settings;
 use crate::synthetic::Synthetic;
 use magex_assign::exact_points;
 use magex_core::about::About;
-use magex_core::config::{CommanderPolicy, RunConfig, SEED_MAX};
+use magex_core::config::{CommanderObjective, CommanderPolicy, RunConfig, SEED_MAX};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::sha256;
@@ -88,6 +88,11 @@ pub(crate) fn run(args: &TrainCommanderArgs, options: &CommonOptions) -> anyhow:
     if config.commander.kind != CommanderPolicy::Pairwise {
         let kind = config.commander.kind;
         return Err(usage(format!("commander.kind: {kind} has a fixed team size; use pairwise")));
+    }
+    if config.commander.objective != CommanderObjective::Distance {
+        return Err(usage(
+            "commander.objective: \"arrival\" is measured in episodes, and there are none; magex train has it",
+        ));
     }
     if args.imitation + args.ppo == 0 {
         return Err(usage("--imitation and --ppo: both are 0; at least one must be positive"));

@@ -254,29 +254,31 @@ mod tests {
     #[test]
     fn greedy_decisions_are_close_to_the_exact_ones_before_any_learning() {
         use super::super::{Commander, Team};
-        use magex_core::config::CommanderConfig;
+        use magex_core::config::{CommanderConfig, CommanderPolicy};
         use magex_core::ids::Mode;
-        let config = CommanderConfig::default();
-        let params = Commander::init(&config, 50, 2, 1).unwrap();
-        let commander = Commander::of(&config, 50, 2, &params).unwrap();
-        for (n, g) in [(2, 2), (5, 5), (50, 50), (30, 60), (60, 30), (200, 200)] {
-            let mut stream = Key::new(5, Purpose::Instances, &[n as u32, g as u32]).stream();
-            let mut draw = |count: usize| (0..2 * count).map(|_| stream.uniform32()).collect::<Vec<f32>>();
-            let (agents, goals) = (draw(n), draw(g));
-            let decision = commander
-                .assign(
-                    &Team { agents: &agents, goals: &goals, dims: 2 },
-                    Mode::Greedy,
-                    &mut Key::new(0, Purpose::Commander, &[]).stream(),
-                )
-                .unwrap();
-            let distance = |(i, &j): (usize, &u32)| {
-                let gap = |k: usize| f64::from(agents[2 * i + k]) - f64::from(goals[2 * j as usize + k]);
-                gap(0).hypot(gap(1))
-            };
-            let cost: f64 = decision.goals.iter().enumerate().filter(|(_, j)| **j != u32::MAX).map(distance).sum();
-            let exact = magex_assign::exact_points(&agents, &goals, 2).unwrap().1;
-            assert!(cost / exact < 1.02, "{n} agents, {g} goals: {}", cost / exact);
+        let nothing = || Key::new(0, Purpose::Commander, &[]).stream();
+        for power in [1.0, 2.0, 4.0] {
+            let config = CommanderConfig { power, ..CommanderConfig::default() };
+            let params = Commander::init(&config, 50, 2, 1).unwrap();
+            let commander = Commander::of(&config, 50, 2, &params).unwrap();
+            let exact = Commander::classical(CommanderPolicy::Exact).unwrap().with_power(power);
+            for (n, g) in [(2, 2), (5, 5), (50, 50), (30, 60), (60, 30), (200, 200)] {
+                let mut stream = Key::new(5, Purpose::Instances, &[n as u32, g as u32]).stream();
+                let mut draw = |count: usize| (0..2 * count).map(|_| stream.uniform32()).collect::<Vec<f32>>();
+                let (agents, goals) = (draw(n), draw(g));
+                let team = Team { agents: &agents, goals: &goals, dims: 2 };
+                let cost = |commander: &Commander| -> f64 {
+                    let decision = commander.assign(&team, Mode::Greedy, &mut nothing()).unwrap();
+                    let chosen = decision.goals.iter().enumerate().filter(|(_, goal)| **goal != u32::MAX);
+                    let distance = |(i, &j): (usize, &u32)| {
+                        let gap = |k: usize| f64::from(agents[2 * i + k]) - f64::from(goals[2 * j as usize + k]);
+                        magex_assign::powered((gap(0).powi(2) + gap(1).powi(2)).sqrt(), power)
+                    };
+                    chosen.map(distance).sum()
+                };
+                let ratio = cost(&commander) / cost(&exact);
+                assert!(ratio < 1.0 + 0.02 * power, "power {power}, {n} agents, {g} goals: {ratio}");
+            }
         }
     }
 }

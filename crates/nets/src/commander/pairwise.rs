@@ -10,6 +10,7 @@ use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
 use magex_assign::duals::sinkhorn_duals;
+use magex_assign::powered;
 
 const FEATURES: usize = 10;
 
@@ -56,22 +57,26 @@ impl PairwiseNet {
     }
 }
 
-/// The side with fewer members picks.
-pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
+/// The side with fewer members picks; `power` is the exponent of the distances.
+pub(super) fn instance(team: &Team<'_>, power: f64) -> Result<Instance, CommanderError> {
     let (n, g) = (team.agent_count(), team.goal_count());
     if n == 0 || g == 0 {
         return Err(CommanderError::Instance("agents and goals must not be empty".to_owned()));
     }
     let swapped = n > g;
     let (rows, columns) = (n.min(g), n.max(g));
-    let cost = distances(team, swapped)?;
+    let mut cost = distances(team, swapped)?;
+    if power != 1.0 {
+        // In units of the mean distance, so that no power leaves the range of single precision where the distances do not.
+        let unit = mean(&cost);
+        cost.iter_mut().for_each(|cost| *cost = (unit * powered(f64::from(*cost) / unit, power)) as f32);
+    }
     // Options that stay free need a price, too: imaginary pickers take them at no cost. Without these the pickers would have
     // to spread over all options.
     let mut filled = cost.clone();
     filled.resize(columns * columns, 0.0);
     let duals = sinkhorn_duals(&filled, columns, columns)?;
-    let mean = (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12) as f32;
-    let spacing = mean / (rows as f32).sqrt();
+    let spacing = mean(&cost) as f32 / (rows as f32).sqrt();
     let unit = MAGNIFY / spacing;
     let mut reduced_costs = cost;
     let mut row_base = Vec::with_capacity(rows);
@@ -96,6 +101,11 @@ pub(super) fn instance(team: &Team<'_>) -> Result<Instance, CommanderError> {
         swapped,
         agents: n,
     })
+}
+
+/// Mean cost, not 0.
+fn mean(cost: &[f32]) -> f64 {
+    (cost.iter().map(|&c| f64::from(c)).sum::<f64>() / cost.len() as f64).max(1e-12)
 }
 
 /// Reduced costs are kept below this: beyond it a pair is hopeless anyway.

@@ -129,3 +129,23 @@ fn labels_do_not_overlap_and_stay_inside_the_picture() {
         assert!(row.windows(2).all(|pair| pair[0][1] < pair[1][0]), "{row:?}");
     }
 }
+
+#[test]
+fn an_environment_of_the_users_own_has_its_return_in_the_large_plot_and_no_empty_ones() {
+    let line = |k: u64| {
+        format!(
+            "{{\"iteration\":{k},\"joint_env_steps\":{},\"success_rate\":null,\"collisions_per_agent_step\":null,\
+             \"arrival_step\":null,\"cost_ratio\":null,\"episode_return\":{},\"sampled_episode_return\":-30,\"reward\":-1}}\n",
+            1000 * k,
+            -20.0 + k as f64
+        )
+    };
+    let svg = draw(&(0..5).map(line).collect::<String>());
+    assert!(svg.contains(">Return, per agent<") && svg.contains(">Reward, "), "{svg}");
+    for absent in ["no data yet", "Success", "Arrival", "Collisions", "Cost"] {
+        assert!(!svg.contains(absent), "{absent} in {svg}");
+    }
+    // The first panel, and as wide as the picture.
+    let (first, second) = (svg.find("Return, ").unwrap(), svg.find("Reward, ").unwrap());
+    assert!(first < second);
+}
