@@ -170,7 +170,7 @@ pub enum CanonicalOrder {
 pub enum CommanderObjective {
     /// R_c = 1 − C_c / C_h of the decision (paper, eq. 4): known before the episode is played.
     Distance,
-    /// The last arrival and the contacts that were measured in the episode.
+    /// The last arrival and the collisions that were measured in the episode.
     Arrival,
 }
 
@@ -190,8 +190,8 @@ section! {
         random_assignment_fraction: f32 = 0.0, 0.0..=1.0;
         /// What the learned kinds are rewarded for.
         objective: CommanderObjective = CommanderObjective::Distance;
-        /// Price of one contact per agent and step, as a share of the horizon, when the objective is the arrival.
-        contact_cost: f32 = 1.0, 0.0..=1000.0;
+        /// Price of one collision per agent and step, as a share of the horizon, when the objective is the arrival.
+        collision_cost: f32 = 1.0, 0.0..=1000.0;
         /// Adam's step size.
         learning_rate: f64 = 1e-3, 0.0..=1.0;
         /// PPO epochs over the iteration's episodes.
@@ -360,15 +360,15 @@ impl RunConfig {
             return Err(FieldError::new("task.reward_target", problem));
         }
         self.commander.check_ranges("commander")?;
-        let CommanderConfig { kind, power, objective, contact_cost, .. } = self.commander;
+        let CommanderConfig { kind, power, objective, collision_cost, .. } = self.commander;
         if objective != CommanderObjective::Distance && !kind.learned() {
             let problem =
                 format!("the {kind} scheduler does not learn; remove it, or use commander.kind = \"pairwise\"");
             return Err(FieldError::new("commander.objective", problem));
         }
-        if objective == CommanderObjective::Distance && contact_cost != CommanderConfig::default().contact_cost {
+        if objective == CommanderObjective::Distance && collision_cost != CommanderConfig::default().collision_cost {
             let problem = "counts only with commander.objective = \"arrival\"; remove it, or set that";
-            return Err(FieldError::new("commander.contact_cost", problem));
+            return Err(FieldError::new("commander.collision_cost", problem));
         }
         // The objective of the distance would lead the pairwise scheduler back to the power 1.
         let arriving = kind == CommanderPolicy::Pairwise && objective == CommanderObjective::Arrival;

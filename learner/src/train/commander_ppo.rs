@@ -115,7 +115,7 @@ impl CommanderPpo {
                     // The scheduler had no say in this episode.
                     continue;
                 }
-                rewards.push(arrival::reward(&t.metrics[b], self.horizon, self.config.contact_cost));
+                rewards.push(arrival::reward(&t.metrics[b], self.horizon, self.config.collision_cost));
                 known.push(Vec::new());
                 for (k, stage) in self.stages.iter().enumerate() {
                     let team = Team {

@@ -1,4 +1,4 @@
-//! The objective `arrival`: how soon the last agent arrived in the episode of a decision, and how often agents touched.
+//! The objective `arrival`: how soon the last agent arrived in the episode of a decision, and how often agents collided.
 //!
 //! The greedy decision's episode is not played, so the baseline is a forecast instead: a least-squares fit of the iteration's
 //! rewards by what is known of each instance before the decision. Like any baseline that does not depend on the decision, it
@@ -13,12 +13,12 @@ const RIDGE: f64 = 1e-6;
 /// Episodes per feature, at least; with fewer the fit would follow the decisions themselves.
 const EPISODES: usize = 4;
 
-/// −(step of the last arrival / horizon) − contact_cost × contacts per agent and step; NaN for a task that measures no arrival.
-pub(super) fn reward(metrics: &EpisodeMetrics, horizon: u32, contact_cost: f32) -> f64 {
+/// −(step of the last arrival / horizon) − collision_cost × collisions per agent and step; NaN for a task that measures no arrival.
+pub(super) fn reward(metrics: &EpisodeMetrics, horizon: u32, collision_cost: f32) -> f64 {
     let of = |metric| metrics.get(metric).map(f64::from);
-    let contacts = of(COLLISIONS_PER_AGENT_STEP).or(of(COLLISION_RATE)).unwrap_or(0.0);
+    let collisions = of(COLLISIONS_PER_AGENT_STEP).or(of(COLLISION_RATE)).unwrap_or(0.0);
     let arrival = of(ARRIVAL_STEP).unwrap_or(f64::NAN);
-    -arrival / f64::from(horizon) - f64::from(contact_cost) * contacts
+    -arrival / f64::from(horizon) - f64::from(collision_cost) * collisions
 }
 
 /// The longest way of an assignment.

@@ -35,7 +35,7 @@ fn the_forecast_takes_out_what_the_instance_explains() {
 }
 
 #[test]
-fn the_reward_is_the_last_arrival_and_the_contacts() {
+fn the_reward_is_the_last_arrival_and_the_collisions() {
     let metrics = EpisodeMetrics::of([(ARRIVAL_STEP, 30.0), (COLLISIONS_PER_AGENT_STEP, 0.25)]);
     assert_eq!(arrival::reward(&metrics, 60, 2.0), -1.0);
     assert!(arrival::reward(&EpisodeMetrics::of([]), 60, 2.0).is_nan());
