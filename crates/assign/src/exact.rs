@@ -97,6 +97,23 @@ impl Solver {
         self.solve_matrix(&Matrix::check(cost, rows, cols, switching)?, should_continue)
     }
 
+    /// Dual prices of the rows of a cost matrix `[n, n]`.
+    pub(crate) fn row_prices(
+        &mut self,
+        cost: &[f64],
+        n: usize,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<Vec<f64>, AssignError> {
+        let mut own = std::mem::take(&mut self.cost);
+        self.stride = n.next_multiple_of(LANES);
+        Matrix::new(cost, n, n).load(&mut own, self.stride);
+        let solved = self.run(&own, n, n, should_continue);
+        self.cost = own;
+        solved?;
+        let price = |(row, &col): (usize, &u32)| cost[row * n + col as usize] - self.price[col as usize];
+        Ok(self.col_of_row.iter().enumerate().map(price).collect())
+    }
+
     /// Solves what was checked.
     fn solve_matrix(
         &mut self,
@@ -371,13 +388,15 @@ fn nearly_tight(
             hit[lane] = reduced[lane] <= limit;
         }
         // Few chunks have one; a branch per entry would take longer than all of the above.
-        if hit.iter().fold(false, |any, &hit| any | hit) {
+        let mut hits = (0..LANES).fold(0u32, |hits, lane| hits | u32::from(hit[lane]) << lane);
+        if hits == 0xff {
             let first = (chunk * LANES) as u32;
-            if hit.iter().fold(true, |all, &hit| all & hit) {
-                near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
-            } else {
-                near.extend((0u32..).zip(hit).filter(|(_, hit)| *hit).map(|(lane, _)| first + lane));
-            }
+            near.extend_from_slice(&[0, 1, 2, 3, 4, 5, 6, 7].map(|lane| first + lane));
+            continue;
+        }
+        while hits > 0 {
+            near.push((chunk * LANES) as u32 + hits.trailing_zeros());
+            hits &= hits - 1;
         }
     }
 }

@@ -3,8 +3,9 @@
 //! Every row knows a few candidates, its cheapest columns by cost − price when they were looked up, and a bound that no other
 //! column was below. Prices only fall, so cost − price only rises and the bound stays true: what is decided below the bound
 //! needs no other column, and what is not looks up more. So every step is that of the dense solver, and memory grows with the
-//! candidates. The steps are an auction with falling ε (Bertsekas 1988), which finds nearly the final prices, and shortest
-//! augmenting paths, which make them final; [`crate::ties`] makes the answer the lowest of the exact optima.
+//! candidates. The steps are a first guess of the prices from a quarter of the rows and columns, solved in the same way; an
+//! auction with falling ε (Bertsekas 1988), which finds nearly the final prices; and shortest augmenting paths, which make them
+//! final. [`crate::ties`] makes the answer the lowest of the exact optima, so the answer depends on none of these steps.
 
 mod auction;
 mod candidates;
@@ -13,6 +14,7 @@ mod line;
 mod pairs;
 mod points;
 mod search;
+mod start;
 mod threshold;
 mod tree;
 
@@ -44,8 +46,7 @@ fn solve<C: Candidates>(
 ) -> Result<Vec<u32>, AssignError> {
     let rows = source.rows();
     let mut engine = Engine::new(source);
-    engine.auction(should_continue)?;
-    engine.search(should_continue)?;
+    engine.run(should_continue)?;
     let mut state = State::of(&engine, order);
     let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
     let mut tolerance = ties::tolerance(rows, magnitude(&state.row_price), magnitude(&state.col_price));

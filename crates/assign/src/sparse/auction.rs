@@ -4,18 +4,17 @@ use super::NONE;
 use super::candidates::{COUNT, Candidates, Engine};
 use crate::AssignError;
 
-/// Bids per row and stage, at most: what is left then is the shortest paths' work.
-const BIDS: usize = 40;
-/// ε falls by this from stage to stage.
-const FALL: f64 = 0.2;
-/// Stages from [`NEAR`] mean differences between the cheapest and the second cheapest column on.
+/// Stages, from [`NEAR`] mean differences between the cheapest and the second cheapest column on; ε falls by [`FALL`] from one
+/// to the next.
 const STAGES: usize = 8;
-const NEAR: f64 = 30.0;
-/// Where that is too little, because clusters compete that are far apart, a stage with [`TRIAL`] bids per row leaves rows over:
-/// then ε begins [`RISE`] stages higher, up to the largest cost / [`FAR`].
-const TRIAL: usize = 12;
-const RISE: usize = 2;
-const FAR: f64 = 16.0;
+const NEAR: f64 = 5.0;
+const FALL: f64 = 0.2;
+/// Bids per row and stage, at most.
+const BIDS: usize = 80;
+/// Rows that outbid each other in turn, at most: one for every so many rows, and at least so many. What is left over then must
+/// go far, which is the shortest paths' work: the auction would lower all prices on the way, little by little.
+const CHAIN: usize = 5;
+const SHORTEST_CHAIN: usize = 256;
 /// Candidates that are looked up at once while most bids need others: fewer are found sooner.
 const FEW: usize = 8;
 
@@ -26,46 +25,62 @@ impl<C: Candidates> Engine<C> {
         let rows = self.col_of_row.len();
         let mut free: Vec<u32> = (0..rows as u32).collect();
         if rows == self.row_of_col.len() && rows > 1 {
-            let mut epsilon = self.first_epsilon();
-            let mut stages = STAGES;
-            self.count = FEW;
-            while epsilon * FAR < self.source.largest_cost() && stages < 2 * STAGES {
-                self.bid(&mut free, epsilon, TRIAL * rows, should_continue)?;
-                if free.is_empty() {
-                    break;
-                }
-                epsilon /= FALL.powi(RISE as i32);
-                stages += RISE;
-            }
-            for _ in 0..stages {
-                let (bids, looks) = (self.bids, self.looks);
-                self.bid(&mut free, epsilon, BIDS * rows, should_continue)?;
-                self.count = if 2 * (self.looks - looks) > self.bids - bids { FEW } else { COUNT };
-                epsilon *= FALL;
-                self.free_unless_best(&mut free, epsilon);
-            }
-            self.count = COUNT;
-            self.free_unless_best(&mut free, 0.0);
+            self.guess(should_continue)?;
+            self.stages(STAGES, should_continue)?;
+            free.clear();
+            self.free_unless_best(&mut free, 0.0, should_continue)?;
         }
-        self.bid(&mut free, 0.0, 4 * rows, should_continue)
+        self.bid(&mut free, 0.0, 4 * rows, usize::MAX, should_continue)
     }
 
-    /// ε of the last [`STAGES`] stages' first one.
-    fn first_epsilon(&mut self) -> f64 {
+    /// Stages of falling ε; returns the last one. Rows that a stage leaves over do not bid in the next ones.
+    pub(super) fn stages(&mut self, stages: usize, should_continue: &dyn Fn() -> bool) -> Result<f64, AssignError> {
+        let rows = self.col_of_row.len();
+        let chain = SHORTEST_CHAIN.max(rows / CHAIN);
+        let mut free: Vec<u32> = (0..rows as u32).collect();
+        let mut epsilon = self.first_epsilon(should_continue)?;
+        self.count = FEW;
+        for stage in 0..stages {
+            if stage > 0 {
+                epsilon *= FALL;
+                free.clear();
+                self.free_unless_best(&mut free, epsilon, should_continue)?;
+            }
+            let (bids, looks) = (self.bids, self.looks);
+            self.bid(&mut free, epsilon, BIDS * rows, chain, should_continue)?;
+            self.count = if 2 * (self.looks - looks) > self.bids - bids { FEW } else { COUNT };
+        }
+        self.count = COUNT;
+        Ok(epsilon)
+    }
+
+    /// ε of the first stage.
+    fn first_epsilon(&mut self, should_continue: &dyn Fn() -> bool) -> Result<f64, AssignError> {
         let rows = self.col_of_row.len();
         let mut sum = 0.0;
         for row in 0..rows as u32 {
+            if row % 1024 == 0 && !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
             let best = self.best(row);
             // A row may have only one column.
             sum += if best.second < f64::INFINITY { best.second - best.least } else { 0.0 };
         }
         // Where many are the same, the differences say nothing.
-        (NEAR * sum / rows as f64).max(1e-4 * self.source.largest_cost())
+        Ok((NEAR * sum / rows as f64).max(1e-7 * self.source.largest_cost()))
     }
 
     /// Frees the rows whose column is not within ε of their cheapest.
-    fn free_unless_best(&mut self, free: &mut Vec<u32>, epsilon: f64) {
+    fn free_unless_best(
+        &mut self,
+        free: &mut Vec<u32>,
+        epsilon: f64,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError> {
         for row in 0..self.col_of_row.len() as u32 {
+            if row % 1024 == 0 && !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
             let col = self.col_of_row[row as usize];
             if col != NONE && self.own(row) > self.best(row).least + epsilon {
                 self.col_of_row[row as usize] = NONE;
@@ -73,15 +88,17 @@ impl<C: Candidates> Engine<C> {
                 free.push(row);
             }
         }
+        Ok(())
     }
 
     /// Every free row takes its cheapest column at a price that makes the second cheapest one better by ε, and the row that had
-    /// it is next. Rows that are left are `free` afterwards.
+    /// it is next, up to `chain` times. Rows that are left are `free` afterwards.
     fn bid(
         &mut self,
         free: &mut Vec<u32>,
         epsilon: f64,
         mut budget: usize,
+        chain: usize,
         should_continue: &dyn Fn() -> bool,
     ) -> Result<(), AssignError> {
         let mut left = Vec::new();
@@ -90,6 +107,7 @@ impl<C: Candidates> Engine<C> {
                 return Err(AssignError::Interrupted);
             }
             let mut row = first;
+            let mut chain = chain;
             loop {
                 self.bids += 1;
                 if self.bids.is_multiple_of(256) && !should_continue() {
@@ -114,8 +132,8 @@ impl<C: Candidates> Engine<C> {
                     break;
                 }
                 self.col_of_row[displaced as usize] = NONE;
-                budget = budget.saturating_sub(1);
-                if !progress || budget == 0 {
+                (budget, chain) = (budget.saturating_sub(1), chain.saturating_sub(1));
+                if !progress || budget == 0 || chain == 0 {
                     left.push(displaced);
                     break;
                 }

@@ -2,6 +2,7 @@
 
 use super::NONE;
 use super::tree::Found;
+use crate::AssignError;
 
 /// Candidates that are looked up at once, as a rule.
 pub(super) const COUNT: usize = 16;
@@ -28,6 +29,13 @@ pub(super) trait Candidates {
     fn reprice(&mut self, col: u32, before: f64, price: &[f64]);
     /// Cost of a pair that was found.
     fn cost(&self, row: u32, col: u32) -> f64;
+    /// A problem with this many of the rows and of the columns, taken evenly; nothing where there is no such thing.
+    fn sample(&self, count: usize) -> Option<Self>
+    where
+        Self: Sized;
+    /// Sets all prices: to the largest at which no row of the sample would have a column cheaper than its `[rows]` least
+    /// cost − price.
+    fn spread(&mut self, sample: &Self, least: &[f64], price: &mut Vec<f64>);
 }
 
 /// The cheapest columns of a row when they were looked up.
@@ -64,6 +72,8 @@ pub(super) struct Engine<C> {
     /// How often that happened, and how often a row bid.
     pub(super) looks: usize,
     pub(super) bids: usize,
+    /// How often shortest paths reached a column.
+    pub(super) reached: usize,
 }
 
 impl<C: Candidates> Engine<C> {
@@ -79,8 +89,15 @@ impl<C: Candidates> Engine<C> {
             count: COUNT,
             looks: 0,
             bids: 0,
+            reached: 0,
             source,
         }
+    }
+
+    /// Finds a cheapest matching of all rows, as far as doubles can tell, and its prices.
+    pub(super) fn run(&mut self, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+        self.auction(should_continue)?;
+        self.search(0.0, should_continue)
     }
 
     pub(super) fn cols(&self) -> usize {

@@ -32,16 +32,16 @@ impl Metric {
         squares.iter_mut().for_each(|cost| *cost = if *cost <= self.limit { *cost } else { f64::INFINITY });
     }
 
-    /// No point that is at least as far along every axis costs less.
-    #[inline]
-    pub(super) fn at_least<const D: usize>(&self, apart: &[f64; D]) -> f64 {
-        let mut square = 0.0;
-        for apart in apart {
-            square += apart * apart;
-        }
-        let cost = powered_square(square, self.power);
+    /// Turns squared distances into what no point that is at least as far away costs less than.
+    #[inline(always)]
+    pub(super) fn at_least<const L: usize>(&self, squares: &mut [f64; L]) {
         // Roots, products and sums are monotone after rounding, too; nothing says so of other powers.
-        if self.power <= 2.0 { cost } else { cost * (1.0 - 1e-14) }
+        if self.power == 1.0 {
+            squares.iter_mut().for_each(|square| *square = square.sqrt());
+        } else if self.power != 2.0 {
+            let least = |square: f64| powered_square(square, self.power) * (1.0 - 1e-14);
+            squares.iter_mut().for_each(|square| *square = least(*square));
+        }
     }
 }
 

@@ -169,6 +169,12 @@ impl Candidates for &List {
 
     fn reprice(&mut self, _: u32, _: f64, _: &[f64]) {}
 
+    fn sample(&self, _: usize) -> Option<Self> {
+        None
+    }
+
+    fn spread(&mut self, _: &Self, _: &[f64], _: &mut Vec<f64>) {}
+
     fn cost(&self, row: u32, col: u32) -> f64 {
         let cost = self.get(row as usize, col as usize).unwrap_or(f64::INFINITY);
         self.priced(row as usize, col, cost)

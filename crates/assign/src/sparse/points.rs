@@ -1,12 +1,14 @@
 //! Assignment of agents to goals by distance, without a cost matrix.
 
-use super::candidates::Candidates;
+mod source;
+
 use super::costs::{Metric, OwnCost, OwnCosts};
-use super::tree::{Found, Tree};
-use super::{Order, line, solve};
+use super::{line, solve};
 use crate::points::{check_points, check_power};
 use crate::ties::Exact;
 use crate::{AssignError, Assignment, LARGEST_COST, Solver, Span, Switching, UNASSIGNED, compensated_sum, costs_into};
+
+pub(super) use source::Points;
 
 /// Members of the longer side from which on the matrix is left out: below, reading it is faster.
 pub(super) const WORTH_IT: usize = 1000;
@@ -33,6 +35,12 @@ impl<'a, T> PointProblem<'a, T> {
     pub fn new(agents: &'a [T], goals: &'a [T], dims: usize) -> Self {
         Self { agents, goals, dims, power: 1.0, costs: &[], switching: Switching::default() }
     }
+
+    /// The same problem of these positions.
+    pub(super) fn with<U>(&self, agents: &'a [U], goals: &'a [U]) -> PointProblem<'a, U> {
+        let &Self { dims, power, costs, switching, .. } = self;
+        PointProblem { agents, goals, dims, power, costs, switching }
+    }
 }
 
 /// As many pairs as possible, then the smallest summed cost + switching cost × switches, then the fewest switches, then the
@@ -54,7 +62,8 @@ pub fn solve_points<T: Copy + Into<f64>>(
         let cost = matrix(problem)?;
         return Solver::default().solve_switching(&cost, rows, cols, &problem.switching, should_continue);
     }
-    solve_sparse(problem, rows, cols, Limit::NONE, should_continue)
+    let (agents, goals) = (in_doubles(problem.agents), in_doubles(problem.goals));
+    solve_sparse(&problem.with(&agents, &goals), rows, cols, Limit::NONE, should_continue)
 }
 
 /// Largest cost of a pair.
@@ -109,22 +118,22 @@ pub fn exact_points<T: Copy + Into<f64>>(
 }
 
 /// Without the matrix; pairs that cost more than the limit are forbidden.
-pub(super) fn solve_sparse<T: Copy + Into<f64>>(
-    problem: &PointProblem<'_, T>,
+pub(super) fn solve_sparse(
+    problem: &PointProblem<'_, f64>,
     rows: usize,
     cols: usize,
     limit: Limit,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     match problem.dims {
-        1 => solve_dims::<T, 1>(problem, rows, cols, limit, should_continue),
-        2 => solve_dims::<T, 2>(problem, rows, cols, limit, should_continue),
-        _ => solve_dims::<T, 3>(problem, rows, cols, limit, should_continue),
+        1 => solve_dims::<1>(problem, rows, cols, limit, should_continue),
+        2 => solve_dims::<2>(problem, rows, cols, limit, should_continue),
+        _ => solve_dims::<3>(problem, rows, cols, limit, should_continue),
     }
 }
 
-fn solve_dims<T: Copy + Into<f64>, const D: usize>(
-    problem: &PointProblem<'_, T>,
+fn solve_dims<const D: usize>(
+    problem: &PointProblem<'_, f64>,
     rows: usize,
     cols: usize,
     limit: Limit,
@@ -132,32 +141,19 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
 ) -> Result<Assignment, AssignError> {
     let turned = rows > cols;
     let metric = Metric { power: problem.power, limit: limit.cost };
-    let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
-    let own = own_costs(problem, &agents, &goals, metric);
+    let (agents, goals) = (problem.agents.as_chunks::<D>().0, problem.goals.as_chunks::<D>().0);
+    let own = own_costs(problem, agents, goals, metric);
     let plain = own.is_empty() && problem.power == 1.0 && limit.cost == f64::INFINITY;
-    if plain && let Some(goal_of) = line::solve(&agents, &goals, should_continue) {
+    if plain && let Some(goal_of) = line::solve(agents, goals, should_continue) {
         let goal_of = goal_of?;
         let cost = crate::pairs(&goal_of).map(|(agent, goal)| metric.cost(&agents[agent], &goals[goal]));
         return Ok(Assignment { cost: compensated_sum(cost), col_of_row: goal_of });
     }
-    let (largest_cost, sink) = largest_costs(&own, &agents, &goals, metric)?;
+    let (largest_cost, sink) = largest_costs(&own, agents, goals, metric)?;
     let sink = sink.filter(|_| !limit.complete);
-    let (short, long) = if turned { (&goals, &agents) } else { (&agents, &goals) };
-    // Neighbours in space become neighbours in memory.
-    let (tree, col_at) = Tree::new(long);
-    let (_, row_at) = Tree::new(short);
-    let mut place_of_col = vec![0; long.len()];
-    (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
-    let source = Points {
-        from: row_at.iter().map(|&row| short[row as usize]).collect(),
-        own: own.places(&row_at, &place_of_col),
-        tree,
-        metric,
-        largest_cost,
-        sink,
-    };
+    let (short, long) = if turned { (goals, agents) } else { (agents, goals) };
+    let (source, order) = Points::new(short, long, metric, &own, largest_cost, sink);
     let exact = PointCosts { from: short, to: long, metric, own: &own, sink: sink.unwrap_or(0.0), turned };
-    let order = Order { row_at, col_at };
     let col_of_row = solve(source, &order, &exact, should_continue)?;
     let mut goal_of = vec![UNASSIGNED; rows];
     for (row, &col) in (0u32..).zip(&col_of_row).filter(|(_, col)| (**col as usize) < long.len()) {
@@ -171,13 +167,14 @@ fn solve_dims<T: Copy + Into<f64>, const D: usize>(
     Ok(Assignment { col_of_row: goal_of, cost })
 }
 
-pub(super) fn points_of<T: Copy + Into<f64>, const D: usize>(values: &[T]) -> Vec<[f64; D]> {
-    values.as_chunks::<D>().0.iter().map(|point| point.map(Into::into)).collect()
+/// The search is no generic code of the callers', whose profile may not optimise it.
+pub(super) fn in_doubles<T: Copy + Into<f64>>(values: &[T]) -> Vec<f64> {
+    values.iter().map(|&value| value.into()).collect()
 }
 
 /// The pairs with costs of their own as the solver sees them: its rows are the shorter side.
-pub(super) fn own_costs<T, const D: usize>(
-    problem: &PointProblem<'_, T>,
+pub(super) fn own_costs<const D: usize>(
+    problem: &PointProblem<'_, f64>,
     agents: &[[f64; D]],
     goals: &[[f64; D]],
     metric: Metric,
@@ -226,89 +223,6 @@ fn largest_costs<const D: usize>(
     }
     let any = forbidden > 0 || metric.limit < f64::INFINITY;
     Ok((span.largest, any.then(|| span.penalty(agents.len().min(goals.len())))))
-}
-
-/// The solver's rows and columns, in the order of their trees.
-struct Points<const D: usize> {
-    from: Vec<[f64; D]>,
-    tree: Tree<D>,
-    metric: Metric,
-    own: OwnCosts,
-    largest_cost: f64,
-    sink: Option<f64>,
-}
-
-impl<const D: usize> Candidates for Points<D> {
-    fn rows(&self) -> usize {
-        self.from.len()
-    }
-
-    fn cols(&self) -> usize {
-        self.tree.points().len()
-    }
-
-    fn largest_cost(&self) -> f64 {
-        self.largest_cost
-    }
-
-    fn sink(&self) -> Option<f64> {
-        self.sink
-    }
-
-    fn nearest(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
-        let own = self.own.of(row as usize);
-        // Those pairs would be counted twice; beyond the others they cost what they cost.
-        let from = &self.from[row as usize];
-        let bound = self.tree.nearest(from, count + own.len(), false, &self.metric, price, found);
-        if !own.is_empty() {
-            found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
-            for pair in own.iter().filter(|pair| pair.terms[0] < f64::INFINITY) {
-                let cost = pair.cost();
-                found.push(Found { reduced: cost - price[pair.col as usize], col: pair.col, cost });
-            }
-        }
-        bound
-    }
-
-    fn nearest_open(&mut self, row: u32, count: usize, price: &[f64], found: &mut Vec<Found>) -> f64 {
-        let own = self.own.of(row as usize);
-        let bound = self.tree.nearest(&self.from[row as usize], count + own.len(), true, &self.metric, price, found);
-        if !own.is_empty() {
-            found.retain(|found| self.own.get(row as usize, found.col as usize).is_none());
-        }
-        bound
-    }
-
-    fn close(&mut self, col: u32) {
-        self.tree.close(col);
-    }
-
-    fn reopen(&mut self, col: u32) {
-        self.tree.reopen(col);
-    }
-
-    fn within(&mut self, row: u32, limit: f64, price: &[f64], found: &mut Vec<u32>) {
-        let start = found.len();
-        self.tree.within(&self.from[row as usize], limit, &self.metric, price, found);
-        let own = self.own.of(row as usize);
-        if !own.is_empty() {
-            let others = found.split_off(start);
-            found.extend(others.into_iter().filter(|&col| self.own.get(row as usize, col as usize).is_none()));
-            let near = |pair: &&OwnCost| pair.cost() - price[pair.col as usize] <= limit;
-            found.extend(own.iter().filter(near).map(|pair| pair.col));
-        }
-    }
-
-    fn reprice(&mut self, col: u32, before: f64, price: &[f64]) {
-        self.tree.reprice(col, before, price);
-    }
-
-    fn cost(&self, row: u32, col: u32) -> f64 {
-        match self.own.get(row as usize, col as usize) {
-            Some(pair) => pair.cost(),
-            None => self.metric.cost(&self.from[row as usize], &self.tree.points()[col as usize]),
-        }
-    }
 }
 
 /// The costs in the order of the problem; the solver's rows are the shorter side.

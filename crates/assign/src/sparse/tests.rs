@@ -1,6 +1,8 @@
+use super::candidates::Engine;
+use super::costs::{Metric, OwnCosts};
 use super::pairs::{AllowedPairs, solve_pairs};
-use super::points::{Limit, PointProblem, check, matrix, solve_sparse};
-use super::threshold::bottleneck_sparse;
+use super::points::{Limit, PointProblem, Points, check, matrix, solve_sparse};
+use super::threshold::{Matching, bottleneck_sparse};
 use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
 use magex_core::rng::{Key, Purpose, Stream};
 
@@ -20,16 +22,24 @@ impl Case {
         let (rows, cols) = (1 + chance.below(most) as usize, 1 + chance.below(most) as usize);
         let cols = if chance.below(3) == 0 { rows } else { cols };
         let dims = 1 + chance.below(3) as usize;
-        // A grid with ties and duplicates, the unit cube, and clusters that are far apart.
-        let kind = chance.below(3);
+        // A grid with ties and duplicates, the unit cube, clusters that are far apart, the same with one of them favoured by
+        // each side, an oblique line, and tiny and huge coordinates.
+        let kind = chance.below(7);
+        let mut side = 0;
         let mut points = |count: usize| -> Vec<f64> {
             let mut values = Vec::new();
+            side += 1;
             for _ in 0..count {
-                let far = f64::from(chance.below(3)) * 1000.0;
+                let cluster = if chance.below(3) == 0 { side } else { chance.below(3) };
+                let far = f64::from(if kind == 3 { cluster } else { chance.below(3) }) * 1000.0;
+                let along = f64::from(chance.below(50));
                 for axis in 0..dims {
                     values.push(match kind {
                         0 => f64::from(chance.below(6)),
                         1 => chance.uniform(),
+                        4 => along * (axis + 1) as f64,
+                        5 => (chance.uniform() + if axis == 0 { far } else { 0.0 }) * 1e-12,
+                        6 => (chance.uniform() - 0.5) * if chance.below(4) == 0 { 1e90 } else { 1e80 },
                         _ => chance.uniform() + if axis == 0 { far } else { 0.0 },
                     });
                 }
@@ -83,6 +93,14 @@ fn compare(first: u32, count: u32, most: u32) {
         let expected = bottleneck.solve_switching(&cost, rows, cols, &problem.switching, &|| true).unwrap();
         assert_eq!(bottleneck_sparse(&problem, rows, cols, &|| true).unwrap(), expected, "bottleneck {index}");
     }
+}
+
+/// Far more cases, and larger ones, than a run of all tests has time for.
+#[test]
+#[ignore = "takes minutes: cargo test -p magex-assign --release -- --ignored"]
+fn many_points_and_pairs_have_the_answers_of_the_matrix() {
+    compare(100_000, 20_000, 60);
+    compare(200_000, 300, 800);
 }
 
 #[test]
@@ -183,4 +201,51 @@ fn twenty_thousand_points_on_a_line_or_at_one_place_are_solved() {
         super::solve_points(&PointProblem::new(&same, &same, 1), &|| false),
         Err(crate::AssignError::Interrupted)
     );
+}
+
+/// Agents or goals in squares of side 1, 100 apart in a row: this many in each.
+fn in_squares(chance: &mut Stream, counts: &[usize]) -> Vec<[f64; 2]> {
+    let mut points = Vec::new();
+    for (square, &count) in counts.iter().enumerate() {
+        points.extend((0..count).map(|_| [square as f64 * 100.0 + chance.uniform(), chance.uniform()]));
+    }
+    points
+}
+
+/// Bids, look-ups and columns that paths reached, per row.
+fn work(from: &[[f64; 2]], to: &[[f64; 2]], power: f64) -> [usize; 3] {
+    let metric = Metric { power, limit: f64::INFINITY };
+    let (points, _) = Points::new(from, to, metric, &OwnCosts::default(), 1e6, None);
+    let mut engine = Engine::new(points);
+    engine.run(&|| true).unwrap();
+    [engine.bids, engine.looks, engine.reached].map(|count| count / from.len())
+}
+
+#[test]
+fn clusters_that_are_far_apart_and_unequal_take_about_as_much_work_as_one() {
+    let mut chance = Key::new(27, Purpose::Bench, &[]).stream();
+    let one: [&[usize]; 2] = [&[1000], &[1000]];
+    let two: [&[usize]; 2] = [&[520, 480], &[480, 520]];
+    let ten: [&[usize]; 2] =
+        [&[130, 95, 100, 90, 110, 80, 105, 95, 100, 95], &[95, 100, 90, 115, 95, 110, 100, 90, 105, 100]];
+    for power in [1.0, 2.0] {
+        for [agents, goals] in [one, two, ten] {
+            let (agents, goals) = (in_squares(&mut chance, agents), in_squares(&mut chance, goals));
+            let [bids, looks, reached] = work(&agents, &goals, power);
+            // 22 to 32, 10 to 23 and 1 to 9. An auction that begins with prices of 0 bids 90 times and looks 60 times.
+            let text = format!("power {power}, {} rows: {bids} bids, {looks} looks, {reached} reached", agents.len());
+            assert!(bids <= 50 && looks <= 40 && reached <= 25, "{text}");
+        }
+    }
+}
+
+#[test]
+fn a_bottleneck_is_found_with_few_looks_per_agent() {
+    let mut chance = Key::new(28, Purpose::Bench, &[]).stream();
+    let (agents, goals) = (in_squares(&mut chance, &[2000]), in_squares(&mut chance, &[2000]));
+    let metric = Metric { power: 1.0, limit: f64::INFINITY };
+    let mut matching = Matching::new(&agents, &goals, metric, &OwnCosts::default());
+    matching.search(&|| true).unwrap();
+    // 97; a bisection that forgets its matching, or its rounds, is far above.
+    assert!(matching.looks <= 150 * agents.len(), "{} looks", matching.looks);
 }

@@ -7,7 +7,7 @@
 
 use super::NONE;
 use super::costs::{Metric, OwnCost, OwnCosts};
-use super::points::{Limit, PointProblem, WORTH_IT, check, matrix, own_costs, points_of, solve_sparse};
+use super::points::{Limit, PointProblem, WORTH_IT, check, in_doubles, matrix, own_costs, solve_sparse};
 use super::tree::Tree;
 use crate::{AssignError, Assignment, BottleneckSolver, UNASSIGNED, pairs};
 
@@ -25,20 +25,21 @@ pub fn bottleneck_points<T: Copy + Into<f64>>(
         let cost = matrix(problem)?;
         return BottleneckSolver::default().solve_switching(&cost, rows, cols, switching, should_continue);
     }
-    bottleneck_sparse(problem, rows, cols, should_continue)
+    let (agents, goals) = (in_doubles(problem.agents), in_doubles(problem.goals));
+    bottleneck_sparse(&problem.with(&agents, &goals), rows, cols, should_continue)
 }
 
 /// Without the matrix, and without regard to a switching cost.
-pub(super) fn bottleneck_sparse<T: Copy + Into<f64>>(
-    problem: &PointProblem<'_, T>,
+pub(super) fn bottleneck_sparse(
+    problem: &PointProblem<'_, f64>,
     rows: usize,
     cols: usize,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Assignment, AssignError> {
     let limit = match problem.dims {
-        1 => threshold::<T, 1>(problem, should_continue)?,
-        2 => threshold::<T, 2>(problem, should_continue)?,
-        _ => threshold::<T, 3>(problem, should_continue)?,
+        1 => threshold::<1>(problem, should_continue)?,
+        2 => threshold::<2>(problem, should_continue)?,
+        _ => threshold::<3>(problem, should_continue)?,
     };
     match limit {
         Some(limit) => solve_sparse(problem, rows, cols, limit, should_continue),
@@ -47,33 +48,19 @@ pub(super) fn bottleneck_sparse<T: Copy + Into<f64>>(
 }
 
 /// The smallest largest cost; nothing if all pairs are forbidden.
-fn threshold<T: Copy + Into<f64>, const D: usize>(
-    problem: &PointProblem<'_, T>,
+fn threshold<const D: usize>(
+    problem: &PointProblem<'_, f64>,
     should_continue: &dyn Fn() -> bool,
 ) -> Result<Option<Limit>, AssignError> {
     let metric = Metric { power: problem.power, limit: f64::INFINITY };
-    let (agents, goals) = (points_of::<T, D>(problem.agents), points_of::<T, D>(problem.goals));
-    let own = own_costs(problem, &agents, &goals, metric);
-    let (short, long) = if agents.len() > goals.len() { (&goals, &agents) } else { (&agents, &goals) };
-    let (tree, col_at) = Tree::new(long);
-    let (_, row_at) = Tree::new(short);
-    let mut place_of_col = vec![0; long.len()];
-    (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
-    let mut matching = Matching {
-        from: row_at.iter().map(|&row| short[row as usize]).collect(),
-        free: tree.clone(),
-        left: tree,
-        metric,
-        own: own.places(&row_at, &place_of_col),
-        col_of_row: vec![NONE; short.len()],
-        row_of_col: vec![NONE; long.len()],
-        reached: Vec::new(),
-    };
-    matching.search(should_continue)
+    let (agents, goals) = (problem.agents.as_chunks::<D>().0, problem.goals.as_chunks::<D>().0);
+    let own = own_costs(problem, agents, goals, metric);
+    let (short, long) = if agents.len() > goals.len() { (goals, agents) } else { (agents, goals) };
+    Matching::new(short, long, metric, &own).search(should_continue)
 }
 
 /// A matching of pairs up to a threshold.
-struct Matching<const D: usize> {
+pub(super) struct Matching<const D: usize> {
     from: Vec<[f64; D]>,
     /// Columns that a round has not met yet, and those of them without a row.
     left: Tree<D>,
@@ -84,10 +71,31 @@ struct Matching<const D: usize> {
     row_of_col: Vec<u32>,
     /// Rows that the last round has reached in vain.
     reached: Vec<u32>,
+    /// How often a row looked for a column.
+    pub(super) looks: usize,
 }
 
 impl<const D: usize> Matching<D> {
-    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
+    /// Without pairs; no more points `from` than points `to`.
+    pub(super) fn new(from: &[[f64; D]], to: &[[f64; D]], metric: Metric, own: &OwnCosts) -> Self {
+        let (tree, col_at) = Tree::new(to);
+        let (_, row_at) = Tree::new(from);
+        let mut place_of_col = vec![0; to.len()];
+        (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
+        Self {
+            from: row_at.iter().map(|&row| from[row as usize]).collect(),
+            free: tree.clone(),
+            left: tree,
+            metric,
+            own: own.places(&row_at, &place_of_col),
+            col_of_row: vec![NONE; from.len()],
+            row_of_col: vec![NONE; to.len()],
+            reached: Vec::new(),
+            looks: 0,
+        }
+    }
+
+    pub(super) fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
         let rows = self.from.len();
         // The dearest of the rows' cheapest pairs is a lower bound.
         let mut low = f64::NEG_INFINITY;
@@ -193,6 +201,7 @@ impl<const D: usize> Matching<D> {
     /// Takes a column that is left and not dearer than the limit: one without a row first, then the cheapest, which leaves the
     /// matching mostly as it is when the limit falls.
     fn reach(&mut self, row: u32, limit: f64) -> Option<u32> {
+        self.looks += 1;
         let Self { own, left, free, from, metric, .. } = self;
         let (from, skip) = (&from[row as usize], |col: u32| own.get(row as usize, col as usize).is_some());
         let listed = own.of(row as usize).iter();
@@ -212,6 +221,7 @@ impl<const D: usize> Matching<D> {
 
     /// The cheapest pair of a row with a column that is left.
     fn cheapest(&mut self, row: u32) -> Option<f64> {
+        self.looks += 1;
         let Self { own, left, from, metric, .. } = self;
         let skip = |col: u32| own.get(row as usize, col as usize).is_some();
         let found = left.cheapest(&from[row as usize], metric, f64::INFINITY, skip).map(|found| found.1);

@@ -2,149 +2,99 @@
 //!
 //! A k-d tree over the columns (Bentley 1975) whose nodes know their box and the largest price below. Cost − price of a point is
 //! at least the cost of the nearest point of its box less that price, so most nodes are never opened. Prices only fall: a price
-//! that is out of date is too large, which keeps the bound valid.
+//! that is out of date is too large, which keeps the bound valid. Three levels of halves are one node, so that the bounds of its
+//! eight children are found together, in vectors.
+
+mod build;
 
 use super::costs::Metric;
 
-/// Points of a leaf, at most: all are looked at together, in vectors.
+/// Points of a leaf, at most: all are looked at together.
 const LEAF: usize = 16;
+/// Children of a node, at most.
+const FAN: usize = 8;
+/// Marks the index of a leaf among children.
+const IS_LEAF: u32 = 1 << 31;
 
 #[derive(Debug, Clone)]
 struct Node<const D: usize> {
-    low: [f64; D],
-    high: [f64; D],
-    /// Points of the node, in the tree's order.
-    start: u32,
-    end: u32,
-    /// The second child; the first one follows its parent. 0 for a leaf.
-    second: u32,
-    /// Of a leaf, where its coordinates are.
-    block: u32,
-    largest_price: f64,
+    /// By axis, of every child; where there is none, infinitely far away.
+    low: [[f64; FAN]; D],
+    high: [[f64; FAN]; D],
+    largest_price: [f64; FAN],
+    child: [u32; FAN],
+    /// Points below each child that are not closed.
+    open: [u32; FAN],
+    at: Place,
 }
 
-/// A tree over points in its own order.
+/// Where a node or a leaf hangs; of the root, [`NOWHERE`].
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    node: u32,
+    lane: u32,
+}
+
+const NOWHERE: Place = Place { node: u32::MAX, lane: 0 };
+
+#[derive(Debug, Clone)]
+struct Leaf<const D: usize> {
+    /// Coordinates by axis; where the leaf has fewer points, the others are infinitely far away.
+    block: [[f64; LEAF]; D],
+    /// Its points, in the tree's order.
+    start: u32,
+    end: u32,
+    at: Place,
+}
+
+/// A tree over points in its own order. The first node is the root.
 #[derive(Debug, Clone)]
 pub(super) struct Tree<const D: usize> {
     nodes: Vec<Node<D>>,
+    leaves: Vec<Leaf<D>>,
     /// `[points]` in the tree's order.
     points: Vec<[f64; D]>,
-    /// The same of every leaf by axis; where it has fewer points, the others are infinitely far away.
-    blocks: Vec<[[f64; LEAF]; D]>,
-    /// `[points]` points that are passed over, and `[nodes]` points below each node that are not.
+    /// `[points]` the leaf of each.
+    leaf_of: Vec<u32>,
+    /// `[points]` points that are passed over.
     closed: Vec<bool>,
-    open: Vec<u32>,
     stack: Vec<(u32, f64)>,
-    path: Vec<u32>,
 }
 
 impl<const D: usize> Tree<D> {
-    /// The tree, and the index of the point at each of its places.
-    pub(super) fn new(points: &[[f64; D]]) -> (Self, Vec<u32>) {
-        let mut order: Vec<u32> = (0..points.len() as u32).collect();
-        let (nodes, open) = (Vec::new(), Vec::new());
-        let mut tree = Self {
-            blocks: Vec::new(),
-            nodes,
-            points: Vec::new(),
-            closed: vec![false; points.len()],
-            open,
-            stack: Vec::new(),
-            path: Vec::new(),
-        };
-        tree.split(points, &mut order, 0);
-        tree.points = order.iter().map(|&point| points[point as usize]).collect();
-        for node in tree.nodes.iter_mut().filter(|node| node.second == 0) {
-            let mut block = [[f64::INFINITY; LEAF]; D];
-            for (lane, point) in tree.points[node.start as usize..node.end as usize].iter().enumerate() {
-                for axis in 0..D {
-                    block[axis][lane] = point[axis];
-                }
-            }
-            node.block = tree.blocks.len() as u32;
-            tree.blocks.push(block);
-        }
-        tree.open = tree.nodes.iter().map(|node| node.end - node.start).collect();
-        (tree, order)
-    }
-
-    fn split(&mut self, points: &[[f64; D]], order: &mut [u32], start: u32) {
-        let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
-        for &point in order.iter() {
-            for (axis, &x) in points[point as usize].iter().enumerate() {
-                (low[axis], high[axis]) = (low[axis].min(x), high[axis].max(x));
-            }
-        }
-        let place = self.nodes.len();
-        let end = start + order.len() as u32;
-        self.nodes.push(Node { low, high, start, end, second: 0, block: 0, largest_price: 0.0 });
-        if order.len() <= LEAF {
-            return;
-        }
-        let mut axis = 0;
-        for other in 1..D {
-            if high[other] - low[other] > high[axis] - low[axis] {
-                axis = other;
-            }
-        }
-        let middle = order.len() / 2;
-        let key = |point: &u32| points[*point as usize][axis];
-        order.select_nth_unstable_by(middle, |a, b| key(a).total_cmp(&key(b)).then(a.cmp(b)));
-        let (first, second) = order.split_at_mut(middle);
-        self.split(points, first, start);
-        self.nodes[place].second = self.nodes.len() as u32;
-        self.split(points, second, start + middle as u32);
-    }
-
     pub(super) fn points(&self) -> &[[f64; D]] {
         &self.points
     }
 
     /// Brings the largest prices up to date after the price of a point has fallen from `before`; `price` is in the tree's order.
     pub(super) fn reprice(&mut self, point: u32, before: f64, price: &[f64]) {
-        self.path.clear();
-        let mut place = 0;
-        loop {
-            let second = self.nodes[place as usize].second;
-            if second == 0 {
-                break;
-            }
-            self.path.push(place);
-            place = if point < self.nodes[second as usize].start { place + 1 } else { second };
-        }
-        let Node { start, end, largest_price, .. } = self.nodes[place as usize];
-        if largest_price > before {
+        let leaf = &self.leaves[self.leaf_of[point as usize] as usize];
+        let mut at = leaf.at;
+        if self.nodes[at.node as usize].largest_price[at.lane as usize] > before {
             return;
         }
-        let mut largest = f64::NEG_INFINITY;
-        price[start as usize..end as usize]
-            .iter()
-            .for_each(|&price| largest = if price > largest { price } else { largest });
-        loop {
-            let node = &mut self.nodes[place as usize];
-            if node.largest_price == largest {
+        let mut largest = largest(&price[leaf.start as usize..leaf.end as usize]);
+        while at.node != NOWHERE.node {
+            let node = &mut self.nodes[at.node as usize];
+            if node.largest_price[at.lane as usize] == largest {
                 return;
             }
-            node.largest_price = largest;
-            let Some(parent) = self.path.pop() else { return };
-            let second = self.nodes[parent as usize].second;
-            let (one, other) =
-                (self.nodes[parent as usize + 1].largest_price, self.nodes[second as usize].largest_price);
-            largest = if other > one { other } else { one };
-            place = parent;
+            node.largest_price[at.lane as usize] = largest;
+            (largest, at) = (node.largest(), node.at);
         }
     }
 
-    /// No point of the node has less cost − price.
-    fn bound(&self, node: u32, from: &[f64; D], metric: &Metric) -> f64 {
-        let node = &self.nodes[node as usize];
-        let mut nearest = [0.0; D];
-        for axis in 0..D {
-            let (below, above) = (node.low[axis] - from[axis], from[axis] - node.high[axis]);
-            let outside = if below > above { below } else { above };
-            nearest[axis] = if outside > 0.0 { outside } else { 0.0 };
+    /// Brings all largest prices up to date.
+    pub(super) fn reprice_all(&mut self, price: &[f64]) {
+        for leaf in &self.leaves {
+            let largest = largest(&price[leaf.start as usize..leaf.end as usize]);
+            self.nodes[leaf.at.node as usize].largest_price[leaf.at.lane as usize] = largest;
         }
-        metric.at_least(&nearest) - node.largest_price
+        // Children come after their parents.
+        for place in (1..self.nodes.len()).rev() {
+            let (largest, at) = (self.nodes[place].largest(), self.nodes[place].at);
+            self.nodes[at.node as usize].largest_price[at.lane as usize] = largest;
+        }
     }
 
     /// Passes over a point until it is opened again.
@@ -158,16 +108,13 @@ impl<const D: usize> Tree<D> {
         self.count(point, |open| *open += 1);
     }
 
-    /// Changes the count of every node above a point.
+    /// Changes the count of everything above a point.
     fn count(&mut self, point: u32, change: impl Fn(&mut u32)) {
-        let mut place = 0;
-        loop {
-            change(&mut self.open[place as usize]);
-            let second = self.nodes[place as usize].second;
-            if second == 0 {
-                return;
-            }
-            place = if point < self.nodes[second as usize].start { place + 1 } else { second };
+        let mut at = self.leaves[self.leaf_of[point as usize] as usize].at;
+        while at.node != NOWHERE.node {
+            let node = &mut self.nodes[at.node as usize];
+            change(&mut node.open[at.lane as usize]);
+            at = node.at;
         }
     }
 
@@ -178,8 +125,41 @@ impl<const D: usize> Tree<D> {
     /// Opens all points.
     pub(super) fn restore(&mut self) {
         self.closed.fill(false);
-        self.open.clear();
-        self.open.extend(self.nodes.iter().map(|node| node.end - node.start));
+        for leaf in &self.leaves {
+            self.nodes[leaf.at.node as usize].open[leaf.at.lane as usize] = leaf.end - leaf.start;
+        }
+        for place in (1..self.nodes.len()).rev() {
+            let (open, at) = (self.nodes[place].open.iter().sum(), self.nodes[place].at);
+            self.nodes[at.node as usize].open[at.lane as usize] = open;
+        }
+    }
+
+    /// Puts the children of a node that may hold a point of cost − price below the limit on the stack, the most promising last.
+    #[inline(always)]
+    fn open(
+        &self,
+        place: u32,
+        from: &[f64; D],
+        metric: &Metric,
+        limit: f64,
+        only_open: bool,
+        stack: &mut Vec<(u32, f64)>,
+    ) {
+        let node = &self.nodes[place as usize];
+        let bounds = node.bounds(from, metric);
+        let first = stack.len();
+        for lane in 0..FAN {
+            let bound = bounds[lane];
+            if bound < limit && !(only_open && node.open[lane] == 0) {
+                let mut at = stack.len();
+                stack.push((node.child[lane], bound));
+                while at > first && stack[at - 1].1 < bound {
+                    stack[at] = stack[at - 1];
+                    at -= 1;
+                }
+                stack[at] = (node.child[lane], bound);
+            }
+        }
     }
 
     /// Replaces `found` by the `count` places with the least cost − price, with their costs, and returns what no other place is
@@ -197,26 +177,20 @@ impl<const D: usize> Tree<D> {
         let mut limit = f64::INFINITY;
         let mut stack = std::mem::take(&mut self.stack);
         stack.clear();
-        stack.push((0, self.bound(0, from, metric)));
+        stack.push((0, f64::NEG_INFINITY));
         while let Some((place, bound)) = stack.pop() {
-            if bound >= limit || (only_open && self.open[place as usize] == 0) {
+            if bound >= limit {
                 continue;
             }
-            let &Node { start, end, second, .. } = &self.nodes[place as usize];
-            if second != 0 {
-                let (first, other) = (place + 1, second);
-                let (near, far) = (self.bound(first, from, metric), self.bound(other, from, metric));
-                // The more promising child is opened first.
-                if near <= far {
-                    stack.extend([(other, far), (first, near)]);
-                } else {
-                    stack.extend([(first, near), (other, far)]);
-                }
+            if place & IS_LEAF == 0 {
+                self.open(place, from, metric, limit, only_open, &mut stack);
                 continue;
             }
-            let (costs, reduced) = self.leaf(place, from, metric, price);
-            for lane in 0..(end - start) as usize {
-                let (cost, reduced, col) = (costs[lane], reduced[lane], start + lane as u32);
+            let leaf = &self.leaves[(place & !IS_LEAF) as usize];
+            let (costs, reduced) = leaf.reduced(from, metric, price);
+            for lane in 0..LEAF {
+                let (cost, reduced, col) = (costs[lane], reduced[lane], leaf.start + lane as u32);
+                // Beyond the leaf's points they are infinite, and so are forbidden ones.
                 if reduced >= limit || (only_open && self.closed[col as usize]) {
                     continue;
                 }
@@ -237,31 +211,6 @@ impl<const D: usize> Tree<D> {
         limit
     }
 
-    /// Costs of the points of a leaf, and these less their prices.
-    #[inline(always)]
-    fn leaf(&self, place: u32, from: &[f64; D], metric: &Metric, price: &[f64]) -> ([f64; LEAF], [f64; LEAF]) {
-        let &Node { start, end, block, .. } = &self.nodes[place as usize];
-        let block = &self.blocks[block as usize];
-        let mut costs = [0.0; LEAF];
-        for axis in 0..D {
-            for lane in 0..LEAF {
-                let difference = from[axis] - block[axis][lane];
-                costs[lane] += difference * difference;
-            }
-        }
-        metric.costs(&mut costs);
-        let mut reduced = [f64::INFINITY; LEAF];
-        // Beyond the leaf's points the costs are infinite, whatever the price.
-        match price[start as usize..].first_chunk::<LEAF>() {
-            Some(price) => (0..LEAF).for_each(|lane| reduced[lane] = costs[lane] - price[lane]),
-            None => {
-                let price = &price[start as usize..end as usize];
-                (0..price.len()).for_each(|lane| reduced[lane] = costs[lane] - price[lane]);
-            }
-        }
-        (costs, reduced)
-    }
-
     /// The cheapest open place that costs up to `limit` and is not to be skipped, and its cost.
     pub(super) fn cheapest(
         &mut self,
@@ -273,25 +222,20 @@ impl<const D: usize> Tree<D> {
         let mut found = None;
         let mut stack = std::mem::take(&mut self.stack);
         stack.clear();
-        stack.push((0, self.bound(0, from, metric)));
+        stack.push((0, f64::NEG_INFINITY));
         while let Some((place, bound)) = stack.pop() {
-            if bound > limit || self.open[place as usize] == 0 {
+            if bound > limit {
                 continue;
             }
-            let &Node { start, end, second, .. } = &self.nodes[place as usize];
-            if second != 0 {
-                let (first, other) = (place + 1, second);
-                let (near, far) = (self.bound(first, from, metric), self.bound(other, from, metric));
-                if near <= far {
-                    stack.extend([(other, far), (first, near)]);
-                } else {
-                    stack.extend([(first, near), (other, far)]);
-                }
+            if place & IS_LEAF == 0 {
+                // What costs the limit itself counts.
+                self.open(place, from, metric, limit.next_up(), true, &mut stack);
                 continue;
             }
-            for point in (start..end).filter(|&point| !self.closed[point as usize] && !skip(point)) {
-                let cost = metric.cost(from, &self.points[point as usize]);
-                if cost < limit || (found.is_none() && cost == limit && cost < f64::INFINITY) {
+            let leaf = &self.leaves[(place & !IS_LEAF) as usize];
+            for (point, cost) in (leaf.start..leaf.end).zip(leaf.costs(from, metric)) {
+                let better = cost < limit || (found.is_none() && cost == limit && cost < f64::INFINITY);
+                if better && !self.closed[point as usize] && !skip(point) {
                     (found, limit) = (Some((point, cost)), cost);
                 }
             }
@@ -306,19 +250,82 @@ impl<const D: usize> Tree<D> {
         stack.clear();
         stack.push((0, f64::NEG_INFINITY));
         while let Some((place, _)) = stack.pop() {
-            if self.bound(place, from, metric) > limit {
+            if place & IS_LEAF == 0 {
+                self.open(place, from, metric, limit.next_up(), false, &mut stack);
                 continue;
             }
-            let &Node { start, end, second, .. } = &self.nodes[place as usize];
-            if second != 0 {
-                stack.extend([(second, 0.0), (place + 1, 0.0)]);
-                continue;
-            }
-            let near = |col: &u32| metric.cost(from, &self.points[*col as usize]) - price[*col as usize] <= limit;
-            found.extend((start..end).filter(near));
+            let leaf = &self.leaves[(place & !IS_LEAF) as usize];
+            let (_, reduced) = leaf.reduced(from, metric, price);
+            found.extend(
+                (leaf.start..leaf.end).zip(reduced).filter(|(_, reduced)| *reduced <= limit).map(|near| near.0),
+            );
         }
         self.stack = stack;
     }
+}
+
+impl<const D: usize> Node<D> {
+    fn largest(&self) -> f64 {
+        (0..FAN).filter(|lane| self.child[*lane] != u32::MAX).fold(f64::NEG_INFINITY, |largest, lane| {
+            let price = self.largest_price[lane];
+            if price > largest { price } else { largest }
+        })
+    }
+
+    /// No point of a child has less cost − price.
+    #[inline(always)]
+    fn bounds(&self, from: &[f64; D], metric: &Metric) -> [f64; FAN] {
+        let mut squares = [0.0; FAN];
+        for axis in 0..D {
+            for lane in 0..FAN {
+                let (below, above) = (self.low[axis][lane] - from[axis], from[axis] - self.high[axis][lane]);
+                let outside = if below > above { below } else { above };
+                let outside = if outside > 0.0 { outside } else { 0.0 };
+                squares[lane] += outside * outside;
+            }
+        }
+        metric.at_least(&mut squares);
+        for lane in 0..FAN {
+            squares[lane] -= self.largest_price[lane];
+        }
+        squares
+    }
+}
+
+impl<const D: usize> Leaf<D> {
+    /// Costs of the points; beyond them, +∞.
+    #[inline(always)]
+    fn costs(&self, from: &[f64; D], metric: &Metric) -> [f64; LEAF] {
+        let mut costs = [0.0; LEAF];
+        for axis in 0..D {
+            for lane in 0..LEAF {
+                let difference = from[axis] - self.block[axis][lane];
+                costs[lane] += difference * difference;
+            }
+        }
+        metric.costs(&mut costs);
+        costs
+    }
+
+    /// Costs of the points, and these less their prices.
+    #[inline(always)]
+    fn reduced(&self, from: &[f64; D], metric: &Metric, price: &[f64]) -> ([f64; LEAF], [f64; LEAF]) {
+        let costs = self.costs(from, metric);
+        let mut reduced = [f64::INFINITY; LEAF];
+        // Beyond the leaf's points the costs are infinite, whatever the price.
+        match price[self.start as usize..].first_chunk::<LEAF>() {
+            Some(price) => (0..LEAF).for_each(|lane| reduced[lane] = costs[lane] - price[lane]),
+            None => {
+                let price = &price[self.start as usize..self.end as usize];
+                (0..price.len()).for_each(|lane| reduced[lane] = costs[lane] - price[lane]);
+            }
+        }
+        (costs, reduced)
+    }
+}
+
+fn largest(price: &[f64]) -> f64 {
+    price.iter().fold(f64::NEG_INFINITY, |largest, &price| if price > largest { price } else { largest })
 }
 
 /// A column, its cost, and that less its price.
