@@ -11,7 +11,7 @@ const NEAR: f64 = 5.0;
 const FALL: f64 = 0.2;
 /// Bids per row and stage, at most.
 const BIDS: usize = 80;
-/// Rows that outbid each other in turn, at most: one for every so many rows, and at least so many. What is left over then must
+/// Rows that outbid each other in turn, at most: rows / [`CHAIN`], but not fewer than [`SHORTEST_CHAIN`]. What is left over must
 /// go far, which is the shortest paths' work: the auction would lower all prices on the way, little by little.
 const CHAIN: usize = 5;
 const SHORTEST_CHAIN: usize = 256;

@@ -115,9 +115,11 @@ fn episodes(commander: &Commander, iteration: u32) -> Trajectory {
 
 /// Mean arrival of the decisions of the last iterations.
 fn trained(objective: CommanderObjective) -> f32 {
-    let mut config = RunConfig::default();
-    config.commander = CommanderConfig { learning_rate: 0.02, objective, ..CommanderConfig::default() };
-    config.task = TaskConfig::simple_spread(2, Spawn::Uniform);
+    let config = RunConfig {
+        commander: CommanderConfig { learning_rate: 0.02, objective, ..CommanderConfig::default() },
+        task: TaskConfig::simple_spread(2, Spawn::Uniform),
+        ..RunConfig::default()
+    };
     let ppo = CommanderPpo::new(&config.commander, &config.task, 1);
     let networks = vec![ppo.init().unwrap()];
     let mut learned = Learned { networks, value_norm: ValueNorm::new(false), replay: None, about: About::of(&config) };
