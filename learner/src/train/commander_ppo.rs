@@ -2,7 +2,7 @@
 //! the decision is made. The baseline is the reward of the greedy decision on the same instance (self-critical), so no critic
 //! is needed.
 //!
-//! With the objective [`arrival`], the reward is what was measured in the episode instead, the same for all its stages. The
+//! With the objective `arrival`, the reward is what was measured in the episode instead, the same for all its stages. The
 //! surrogate is clipped pick by pick: the ratio of a whole 50-agent decision would leave the clip range at once.
 
 mod arrival;
