@@ -35,7 +35,13 @@ pub(super) trait Candidates {
         Self: Sized;
     /// Sets all prices: to the largest at which no row of the sample would have a column cheaper than its `[rows]` least
     /// cost − price.
-    fn spread(&mut self, sample: &Self, least: &[f64], price: &mut Vec<f64>);
+    fn spread(
+        &mut self,
+        sample: &Self,
+        least: &[f64],
+        price: &mut Vec<f64>,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError>;
 }
 
 /// The cheapest columns of a row when they were looked up.

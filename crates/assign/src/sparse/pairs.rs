@@ -173,7 +173,9 @@ impl Candidates for &List {
         None
     }
 
-    fn spread(&mut self, _: &Self, _: &[f64], _: &mut Vec<f64>) {}
+    fn spread(&mut self, _: &Self, _: &[f64], _: &mut Vec<f64>, _: &dyn Fn() -> bool) -> Result<(), AssignError> {
+        Ok(())
+    }
 
     fn cost(&self, row: u32, col: u32) -> f64 {
         let cost = self.get(row as usize, col as usize).unwrap_or(f64::INFINITY);

@@ -30,7 +30,7 @@ impl<C: Candidates> Engine<C> {
         };
         let mut engine = Engine::new(sample);
         let least = engine.least(should_continue)?;
-        self.source.spread(&engine.source, &least, &mut self.price);
+        self.source.spread(&engine.source, &least, &mut self.price, should_continue)?;
         self.bids += engine.bids;
         self.looks += engine.looks;
         self.reached += engine.reached;

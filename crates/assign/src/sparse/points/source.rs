@@ -1,5 +1,6 @@
 //! Points as the solver's rows and columns.
 
+use crate::AssignError;
 use crate::sparse::Order;
 use crate::sparse::candidates::Candidates;
 use crate::sparse::costs::{Metric, OwnCost, OwnCosts};
@@ -118,17 +119,27 @@ impl<const D: usize> Candidates for Points<D> {
         Some(Self::new(&from, &to, metric, &OwnCosts::default(), self.largest_cost, None).0)
     }
 
-    fn spread(&mut self, sample: &Self, least: &[f64], price: &mut Vec<f64>) {
+    fn spread(
+        &mut self,
+        sample: &Self,
+        least: &[f64],
+        price: &mut Vec<f64>,
+        should_continue: &dyn Fn() -> bool,
+    ) -> Result<(), AssignError> {
         // The sample's rows take the place of columns.
         let (mut tree, order) = Tree::new(&sample.from);
         let least: Vec<f64> = order.iter().map(|&row| least[row as usize]).collect();
         tree.reprice_all(&least);
         let mut found = Vec::new();
         price.clear();
-        for to in self.tree.points() {
+        for (place, to) in self.tree.points().iter().enumerate() {
+            if place % 1024 == 0 && !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
             tree.nearest(to, 1, false, &sample.metric, &least, &mut found);
             price.push(found.first().map_or(0.0, |found| found.reduced));
         }
         self.tree.reprice_all(price);
+        Ok(())
     }
 }
