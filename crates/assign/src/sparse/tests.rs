@@ -232,7 +232,7 @@ fn clusters_that_are_far_apart_and_unequal_take_about_as_much_work_as_one() {
         for [agents, goals] in [one, two, ten] {
             let (agents, goals) = (in_squares(&mut chance, agents), in_squares(&mut chance, goals));
             let [bids, looks, reached] = work(&agents, &goals, power);
-            // 22 to 32, 10 to 23 and 1 to 9. An auction that begins with prices of 0 bids 90 times and looks 60 times.
+            // 22 to 32, 10 to 23 and 1 to 9. Without the first guess of the prices, 57 looks and 38 columns reached.
             let text = format!("power {power}, {} rows: {bids} bids, {looks} looks, {reached} reached", agents.len());
             assert!(bids <= 50 && looks <= 40 && reached <= 25, "{text}");
         }
