@@ -246,6 +246,26 @@ fn offset(from: &[f32], to: &[f32]) -> ([f32; 3], f32) {
 }
 
 impl Features {
+    /// None yet, with room for `count` rows like those of `other`, which has `rows` rows of teams of N agents.
+    pub fn with_room(other: &Self, rows: usize, agents: usize, count: usize) -> Self {
+        fn room<T>(source: &[T], rows: usize, count: usize) -> Vec<T> {
+            Vec::with_capacity(source.len() / rows.max(1) * count)
+        }
+        let (states, joint) = (count / agents.max(1), rows / agents.max(1));
+        Self {
+            nodes: room(&other.nodes, rows, count),
+            pairs: room(&other.pairs, rows, count),
+            goals: room(&other.goals, rows, count),
+            neighbours: room(&other.neighbours, rows, count),
+            counts: room(&other.counts, rows, count),
+            vectors: room(&other.vectors, rows, count),
+            states: room(&other.states, joint, states),
+            masks: room(&other.masks, rows, count),
+            firsts: room(&other.firsts, joint, states),
+            symmetries: room(&other.symmetries, rows, count),
+        }
+    }
+
     /// Appends the rows `from..from + count` of the `rows` of `other`: whole joint states of N agents.
     pub fn append(&mut self, other: &Self, (from, count): (usize, usize), rows: usize, agents: usize) {
         fn copy<T: Copy>(to: &mut Vec<T>, source: &[T], from: usize, count: usize, rows: usize) {

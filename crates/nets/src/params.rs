@@ -1,6 +1,7 @@
 //! Parameters: one flat, ordered vector of values with names and shapes. The order is the order of construction, so a
 //! norm or a hash over it is always summed the same way. candle's `VarMap` is a hash map and draws from a global generator.
 
+use crate::ops::with_values;
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result as CandleResult, Tensor, Var};
 use magex_core::rng::Stream;
@@ -189,7 +190,7 @@ impl Params {
         let mut flat = Vec::with_capacity(if variables.is_empty() { 0 } else { self.values.len() });
         for variable in variables {
             match gradients.get(variable) {
-                Some(gradient) => flat.extend(gradient.flatten_all()?.to_vec1::<f32>()?),
+                Some(gradient) => with_values(&gradient.contiguous()?, |values| flat.extend_from_slice(values))?,
                 None => flat.resize(flat.len() + variable.elem_count(), 0.0),
             }
         }

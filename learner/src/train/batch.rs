@@ -78,7 +78,8 @@ impl Batch {
     /// Features of `steps` steps from `start` of several episodes, ordered [L, C, N].
     fn gather(&self, units: &[(usize, usize)], steps: usize) -> Features {
         let (n, rows) = (self.shape.agents, (self.shape.steps + 1) * self.shape.agents);
-        let mut out = Features::default();
+        let Some(first) = self.features.first() else { return Features::default() };
+        let mut out = Features::with_room(first, rows, n, units.len() * steps * n);
         for l in 0..steps {
             for &(episode, start) in units {
                 out.append(&self.features[episode], ((start + l) * n, n), rows, n);

@@ -28,8 +28,8 @@ impl Module for Norm {
 
 /// A network from what enters its memory to its outputs: layers, GRU of H units (a multiple of 16), layer normalisation, head.
 pub(super) struct Memory {
-    /// Ends with the input projection of the gates [R, 3H].
-    gates: Chain,
+    /// What the gates see [R, H].
+    first: Chain,
     gru: Gru,
     head: Chain,
     width: usize,
@@ -43,12 +43,12 @@ impl Memory {
         (outputs, head_gain): (usize, f64),
         params: &mut ParamBuilder,
     ) -> Result<Self, ParamError> {
-        let identity = Activation::Identity;
-        let gates = first.dense("gru.input", 3 * width, identity, 1.0).build(params)?;
-        let weight = params.tensor("gru.weight", &[width, 3 * width], Init::Orthogonal(1.0))?;
+        let (identity, zero) = (Activation::Identity, Init::Constant(0.0));
+        let inputs = first.width();
+        let inits = [Init::Orthogonal(1.0), zero, Init::Orthogonal(1.0), zero];
         Ok(Self {
-            gates,
-            gru: Gru::new(weight, params.tensor("gru.bias", &[3 * width], Init::Constant(0.0))?),
+            first: first.build(params)?,
+            gru: Gru::build("gru", (inputs, width), inits, params)?,
             head: ChainBuilder::new()
                 .input(width)
                 .norm("gru.norm")
@@ -61,10 +61,10 @@ impl Memory {
     /// `x` is the input of the first layers, if they have one.
     pub(super) fn forward(&self, x: Option<&Tensor>, input: &Input<'_>) -> CandleResult<Output> {
         let sequences = input.sequences * input.agents;
-        let gates = self.gates.forward(x, input.features)?.reshape((input.steps, sequences, 3 * self.width))?;
+        let features = self.first.forward(x, input.features)?;
         // The state of a world's agents ends with its episode.
         let firsts = input.features.firsts.iter().flat_map(|first| std::iter::repeat_n(*first, input.agents)).collect();
-        let states = self.gru.forward(&gates, input.hidden.clone(), firsts)?;
+        let states = self.gru.forward(&features, input.hidden.clone(), firsts)?;
         let flat = states.reshape((input.steps * sequences, self.width))?;
         Ok(Output { out: self.head.forward(Some(&flat), input.features)?, states: Some(states) })
     }

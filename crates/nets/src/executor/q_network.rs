@@ -26,8 +26,7 @@ pub struct QNetwork {
 
 enum Second {
     Layer(Layer),
-    /// Input projection and gated recurrent unit.
-    Memory(Layer, Gru),
+    Memory(Gru),
 }
 
 /// Choices [.., H] as ones in rows of zeros [.., A].
@@ -52,9 +51,7 @@ impl QNetwork {
         Ok(Self {
             first: Layer::uniform(params, "first", (inputs, h), Activation::Relu)?.on_features(),
             second: if config.executor.recurrent {
-                let input = Layer::uniform(params, "gru.input", (h, 3 * h), Activation::Identity)?;
-                let weight = params.tensor("gru.weight", &[h, 3 * h], bound)?;
-                Second::Memory(input, Gru::new(weight, params.tensor("gru.bias", &[3 * h], bound)?))
+                Second::Memory(Gru::build("gru", (h, h), [bound; 4], params)?)
             } else {
                 Second::Layer(Layer::uniform(params, "second", (h, h), Activation::Relu)?)
             },
@@ -95,10 +92,9 @@ impl QNetwork {
         let first = self.first.forward(&inputs)?;
         let (features, states) = match &self.second {
             Second::Layer(layer) => (layer.forward(&first)?, None),
-            Second::Memory(input, gru) => {
+            Second::Memory(gru) => {
                 let rows = vectors.len() / width / steps;
-                let gates = input.forward(&first)?.reshape((steps, rows, 3 * self.hidden))?;
-                let states = gru.forward(&gates, memory, Vec::new())?;
+                let states = gru.forward(&first, memory, Vec::new())?;
                 (states.reshape((steps * rows, self.hidden))?, Some(states))
             }
         };

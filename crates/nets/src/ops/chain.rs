@@ -195,7 +195,7 @@ impl ChainBuilder {
 
     /// A dense layer.
     pub fn dense(mut self, name: &str, outputs: usize, act: Activation, gain: f64) -> Self {
-        let inputs = self.layout.widths().last().copied().unwrap_or(0);
+        let inputs = self.width();
         let dense = self.weights(name, (inputs, outputs), act, gain);
         self.layout.layers.push(Layer::Dense(dense));
         self
@@ -203,11 +203,16 @@ impl ChainBuilder {
 
     /// Layer normalisation.
     pub fn norm(mut self, name: &str) -> Self {
-        let width = self.layout.widths().last().copied().unwrap_or(0);
+        let width = self.width();
         let at = self.member(format!("{name}.scale"), &[width], Init::Constant(1.0));
         self.member(format!("{name}.shift"), &[width], Init::Constant(0.0));
         self.layout.layers.push(Layer::Norm(width, at));
         self
+    }
+
+    /// Numbers of a row behind the last layer so far.
+    pub fn width(&self) -> usize {
+        self.layout.widths().last().copied().unwrap_or(0)
     }
 
     /// With the next parameters.

@@ -39,12 +39,15 @@ impl Gradient {
             let count = BLOCK.min(rows - first);
             let x = x.skip(first * x.stride);
             let dz = dz.skip(first * dz.stride);
-            for v in (0..padded).step_by(LANES) {
-                let mut sum = load(&self.db[v..]);
-                for row in dz.values.chunks(dz.stride).take(count) {
-                    sum += load(&row[v..]);
-                }
-                store(sum, &mut self.db[v..]);
+            // Several sums at once hide the latency of an addition; each has its own order either way.
+            let mut v = 0;
+            while v + 4 * LANES <= padded {
+                bias::<4>(dz.skip(v), &mut self.db[v..], count);
+                v += 4 * LANES;
+            }
+            while v < padded {
+                bias::<1>(dz.skip(v), &mut self.db[v..], count);
+                v += LANES;
             }
             if self.transposed {
                 block(dz, n, x, k, &mut self.dw, count, VECTORS);
@@ -71,6 +74,18 @@ impl Gradient {
             db.copy_from_slice(&self.db[..n]);
         }
     }
+}
+
+/// sums += rows of dz.
+#[inline(always)]
+fn bias<const Q: usize>(dz: Rows<'_>, sums: &mut [f32], rows: usize) {
+    let mut acc: [f32x16; Q] = std::array::from_fn(|q| load(&sums[q * LANES..]));
+    for dz in dz.values.chunks(dz.stride).take(rows) {
+        for (q, acc) in acc.iter_mut().enumerate() {
+            *acc += load(&dz[q * LANES..]);
+        }
+    }
+    acc.into_iter().zip(sums.chunks_mut(LANES)).for_each(|(acc, sums)| store(acc, sums));
 }
 
 /// sums [k, width] += xᵀ · dz for a block of rows; `width` is a multiple of the vectors' length.

@@ -1,8 +1,9 @@
 mod gradients;
 
 use super::buffer::Buffer;
+use super::matmul::Rows;
 use super::operation::{Arg, Operation, apply3};
-use super::simd::{LANES, load, store};
+use super::simd::{LANES, ln_of_normal, load, store, transpose};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::{Arc, OnceLock};
 use wide::f32x16;
@@ -74,13 +75,17 @@ struct Scratch {
     sender: Vec<f32>,
     /// [P, padded] v_j + q_j, transposed so that one vector holds sixteen neighbours.
     receiver: Vec<f32>,
+    /// [N, P] the same before it is transposed.
+    rows: Vec<f32>,
 }
 
 impl Op {
     fn scratch(&self) -> Scratch {
         let padded = self.block.agents.div_ceil(LANES) * LANES;
         let p = self.block.pair_hidden;
-        Scratch { padded, sender: vec![0.0; self.block.agents * p], receiver: vec![0.0; p * padded] }
+        let zeros = |count: usize| vec![0.0; count];
+        let own = self.block.agents * p;
+        Scratch { padded, sender: zeros(own), receiver: zeros(p * padded), rows: zeros(own) }
     }
 
     fn columns(&self) -> usize {
@@ -89,13 +94,37 @@ impl Op {
 
     fn load_pairs(&self, features: &[f32], relative: &[f32], scratch: &mut Scratch) {
         let (n, p, columns) = (self.block.agents, self.block.pair_hidden, self.columns());
+        let Scratch { padded, sender, receiver, rows } = scratch;
         for i in 0..n {
-            let (row, q) = (&features[i * columns..], &relative[i * p..(i + 1) * p]);
-            for k in 0..p {
-                scratch.sender[i * p + k] = row[k] - q[k];
-                scratch.receiver[k * scratch.padded + i] = row[p + k] + q[k];
+            let (row, q, to) = (&features[i * columns..], &relative[i * p..(i + 1) * p], i * p..(i + 1) * p);
+            for ((to, u), q) in sender[to.clone()].iter_mut().zip(&row[..p]).zip(q) {
+                *to = u - q;
+            }
+            for ((to, v), q) in rows[to].iter_mut().zip(&row[p..2 * p]).zip(q) {
+                *to = v + q;
             }
         }
+        transpose(Rows::new(rows, p), n, p, receiver, *padded);
+    }
+
+    /// Edges of agent i.
+    #[inline(always)]
+    fn degree(&self, i: usize, logits: &[f32]) -> usize {
+        (0..logits.len()).step_by(LANES).map(|v| self.edge_mask(i, logits, v).count_ones() as usize).sum()
+    }
+
+    /// One bit for each of the neighbours from v on that an edge leads to.
+    #[inline(always)]
+    fn edge_mask(&self, i: usize, logits: &[f32], v: usize) -> u32 {
+        let n = self.block.agents;
+        let mut mask = load(&logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
+        if n - v < LANES {
+            mask &= (1 << (n - v)) - 1;
+        }
+        if (v..v + LANES).contains(&i) {
+            mask &= !(1 << (i - v));
+        }
+        mask
     }
 
     /// Logits plus noise of agent i towards all others, sixteen neighbours at a time.
@@ -147,16 +176,9 @@ impl Op {
     /// Calls `f` for every present edge i → j, in ascending j. Returns the degree.
     #[inline(always)]
     fn edges(&self, i: usize, logits: &[f32], mut f: impl FnMut(usize)) -> usize {
-        let n = self.block.agents;
         let mut degree = 0;
         for v in (0..logits.len()).step_by(LANES) {
-            let mut mask = load(&logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
-            if n - v < LANES {
-                mask &= (1 << (n - v)) - 1;
-            }
-            if (v..v + LANES).contains(&i) {
-                mask &= !(1 << (i - v));
-            }
+            let mut mask = self.edge_mask(i, logits, v);
             degree += mask.count_ones() as usize;
             while mask != 0 {
                 f(v + mask.trailing_zeros() as usize);
@@ -239,7 +261,7 @@ fn logistic(key: u64, counter: u32) -> f32x16 {
         *slot = (bits as f32 + 0.5) * (1.0 / 8_388_608.0);
     }
     let u = f32x16::new(uniform);
-    (u / (f32x16::ONE - u)).ln()
+    ln_of_normal(u / (f32x16::ONE - u))
 }
 
 impl Operation<3> for Op {

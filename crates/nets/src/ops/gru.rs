@@ -1,49 +1,86 @@
 use super::buffer::Buffer;
 use super::gradient::Gradient;
 use super::matmul::{Activation, Packed, Rows, Start, layer};
-use super::operation::{Arg, Operation, apply3};
+use super::operation::{Arg, Operation, apply2};
 use super::simd::{LANES, load, sigmoid, store, tanh};
+use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 use wide::f32x16;
 
-/// Gated recurrent unit of H units, gates in the order reset, update, new (the convention of PyTorch).
+/// Gated recurrent unit of H units on I inputs, gates in the order reset, update, new (the convention of PyTorch), with the projection
+/// of its inputs: one operation, so that the gates' 3H numbers of a row never leave the cache.
 #[derive(Clone)]
 pub struct Gru {
-    /// [H, 3H]
-    weight: Tensor,
-    /// `[3H]`
-    bias: Tensor,
+    sizes: Sizes,
+    /// w_x [I, 3H], b_x `[3H]`, w_h [H, 3H] and b_h `[3H]` one after the other.
+    parameters: Tensor,
     packs: Arc<Packs>,
 }
 
+#[derive(Clone, Copy)]
+struct Sizes {
+    inputs: usize,
+    hidden: usize,
+}
+
+impl Sizes {
+    fn triple(self) -> usize {
+        3 * self.hidden
+    }
+
+    /// Where w_x, b_x, w_h and b_h stand.
+    fn ranges(self) -> [Range<usize>; 4] {
+        let mut at = 0;
+        [self.inputs * self.triple(), self.triple(), self.hidden * self.triple(), self.triple()].map(|len| {
+            at += len;
+            at - len..at
+        })
+    }
+}
+
+/// Weights of input and state as the kernels want them; made once for all uses.
 #[derive(Default)]
 struct Packs {
-    forward: OnceLock<Packed>,
-    backward: OnceLock<Packed>,
+    forward: OnceLock<[Packed; 2]>,
+    backward: OnceLock<[Packed; 2]>,
 }
 
 impl Gru {
-    /// With recurrent weights [H, 3H] and their bias `[3H]`.
-    pub fn new(weight: Tensor, bias: Tensor) -> Self {
-        Self { weight, bias, packs: Arc::default() }
+    /// With the next parameters: `name.input.weight` and `name.input.bias`, `name.weight` and `name.bias`, each drawn as `inits` say.
+    pub fn build(
+        name: &str,
+        (inputs, hidden): (usize, usize),
+        inits: [Init; 4],
+        params: &mut ParamBuilder,
+    ) -> std::result::Result<Self, ParamError> {
+        let names = ["input.weight", "input.bias", "weight", "bias"].map(|part| format!("{name}.{part}"));
+        let triple = 3 * hidden;
+        let shapes = [vec![inputs, triple], vec![triple], vec![hidden, triple], vec![triple]];
+        let members = names.into_iter().zip(shapes).zip(inits).map(|((name, shape), init)| (name, shape, init));
+        let parameters = params.group(members.collect())?;
+        Ok(Self { sizes: Sizes { inputs, hidden }, parameters, packs: Arc::default() })
     }
 
-    /// Over a sequence: `input` [L, R, 3H] is x·W_x + b_x for all steps at once, `h0` [R·H] the state that enters the sequence
-    /// (constant: the gradient is truncated there), `firsts` [L, R] 1 where a sequence begins anew from a state of zeros (empty:
-    /// nowhere). Returns all states [L, R, H].
-    pub fn forward(&self, input: &Tensor, h0: Vec<f32>, firsts: Vec<u8>) -> Result<Tensor> {
-        let keep = [input, &self.weight, &self.bias].into_iter().any(Tensor::track_op);
-        let op = Op { h0, firsts, packs: self.packs.clone(), keep, saved: OnceLock::new() };
-        apply3(op, [input, &self.weight, &self.bias])
+    /// Over a sequence: `x` [L·R, I] holds the inputs of all steps, `h0` [R·H] the state that enters the sequence (constant: the
+    /// gradient is truncated there), `firsts` [L, R] 1 where a sequence begins anew from a state of zeros (empty: nowhere). Returns
+    /// all states [L, R, H].
+    pub fn forward(&self, x: &Tensor, h0: Vec<f32>, firsts: Vec<u8>) -> Result<Tensor> {
+        let keep = x.track_op() || self.parameters.track_op();
+        let op = Op { sizes: self.sizes, h0, firsts, packs: self.packs.clone(), keep, saved: OnceLock::new() };
+        apply2(op, [x, &self.parameters])
     }
 }
 
 /// Rows that pass through all steps before the next ones do: their state stays in the first cache levels.
 const TILE: usize = 48;
 
+/// Rows of several steps that the gradient of the weights takes in at once: each pass reads and writes all of its sums.
+const TOGETHER: usize = 96;
+
 struct Op {
+    sizes: Sizes,
     h0: Vec<f32>,
     firsts: Vec<u8>,
     packs: Arc<Packs>,
@@ -53,22 +90,32 @@ struct Op {
     saved: OnceLock<Buffer>,
 }
 
-/// L, R and H.
-fn sizes(x: &Arg<'_>) -> Result<(usize, usize, usize)> {
-    let [steps, rows, triple] = *x.dims else { bail!("gru: input {:?} is not [L, R, 3H]", x.dims) };
-    Ok((steps, rows, triple / 3))
-}
-
 impl Op {
+    /// L and R.
+    fn steps_and_rows(&self, x: &Arg<'_>) -> Result<(usize, usize)> {
+        let Sizes { inputs, hidden } = self.sizes;
+        let (all, width) = x.rows();
+        let rows = self.h0.len() / hidden.max(1);
+        if hidden == 0 || hidden % LANES != 0 || width != inputs || rows == 0 || all % rows != 0 {
+            bail!(
+                "gru: input {:?} and {} initial states do not fit {inputs} inputs, {hidden} units",
+                x.dims,
+                self.h0.len()
+            );
+        }
+        Ok((all / rows, rows))
+    }
+
     /// Zeros the rows of a tile, in `out`, whose sequences begin with step t. `None` if none does.
     fn begun<'a>(
         &self,
         old: &[f32],
         t: usize,
-        (rows, hidden): (usize, usize),
+        rows: usize,
         tile: &Range<usize>,
         out: &'a mut Vec<f32>,
     ) -> Option<&'a [f32]> {
+        let hidden = self.sizes.hidden;
         let firsts = self.firsts.get(t * rows + tile.start..t * rows + tile.end)?;
         if firsts.iter().all(|first| *first == 0) {
             return None;
@@ -82,23 +129,28 @@ impl Op {
     }
 }
 
+/// Tiles of about the same height, which is a multiple of the rows that a product holds in registers.
 fn tiles(rows: usize) -> impl Iterator<Item = Range<usize>> {
-    (0..rows).step_by(TILE).map(move |from| from..rows.min(from + TILE))
+    let height = rows.div_ceil(rows.div_ceil(TILE).max(1)).next_multiple_of(6);
+    (0..rows).step_by(height.max(1)).map(move |from| from..rows.min(from + height))
 }
 
-impl Operation<3> for Op {
+impl Operation<2> for Op {
     const NAME: &'static str = "gru";
 
-    fn forward(&self, [x, w, b]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
-        let (steps, rows, hidden) = sizes(&x)?;
-        let triple = 3 * hidden;
-        if hidden % LANES != 0 || w.dims != [hidden, triple] || b.dims != [triple] || self.h0.len() != rows * hidden {
-            bail!("gru: input {:?}, w {:?}, {} initial states do not fit", x.dims, w.dims, self.h0.len());
-        }
-        let pack = self.packs.forward.get_or_init(|| Packed::new(w.values, hidden, triple));
+    fn forward(&self, [x, p]: [Arg<'_>; 2]) -> Result<(Vec<f32>, Shape)> {
+        let (steps, rows) = self.steps_and_rows(&x)?;
+        let (Sizes { inputs, hidden }, triple, [w_x, b_x, w_h, b_h]) =
+            (self.sizes, self.sizes.triple(), self.sizes.ranges());
+        let packs = self
+            .packs
+            .forward
+            .get_or_init(|| [Packed::new(&p.values[w_x], inputs, triple), Packed::new(&p.values[w_h], hidden, triple)]);
+        let biases = [&p.values[b_x], &p.values[b_h]];
         let mut states = vec![0.0; steps * rows * hidden];
         let mut saved = Buffer::take(if self.keep { steps * rows * 4 * hidden } else { 4 * hidden });
-        let mut recurrent = Buffer::take(TILE.min(rows) * triple);
+        let mut gates = Buffer::take(2 * TILE * triple);
+        let (of_input, of_state) = gates.split_at_mut(TILE * triple);
         let mut begun = Vec::new();
         for tile in tiles(rows) {
             for t in 0..steps {
@@ -108,14 +160,19 @@ impl Operation<3> for Op {
                     _ => &before[(t - 1) * rows * hidden..],
                 };
                 let old = &before[tile.start * hidden..tile.end * hidden];
-                let old = self.begun(old, t, (rows, hidden), &tile, &mut begun).unwrap_or(old);
-                let u = &mut recurrent[..tile.len() * triple];
-                layer(Rows::new(old, hidden), pack, Start::Bias(b.values), Activation::Identity, u, triple, tile.len());
-                for (i, (r, u)) in tile.clone().zip(u.chunks_exact(triple)).enumerate() {
-                    let at = t * rows + r;
-                    let keep = if self.keep { at } else { 0 };
-                    gates(
-                        &x.values[at * triple..][..triple],
+                let old = self.begun(old, t, rows, &tile, &mut begun).unwrap_or(old);
+                let x = &x.values[(t * rows + tile.start) * inputs..(t * rows + tile.end) * inputs];
+                for (from, w, b, to) in [
+                    (Rows::new(x, inputs), &packs[0], biases[0], &mut *of_input),
+                    (Rows::new(old, hidden), &packs[1], biases[1], &mut *of_state),
+                ] {
+                    layer(from, w, Start::Bias(b), Activation::Identity, to, triple, tile.len());
+                }
+                let projected = of_input.chunks_exact(triple).zip(of_state.chunks_exact(triple));
+                for ((i, r), (x, u)) in tile.clone().enumerate().zip(projected) {
+                    let keep = if self.keep { t * rows + r } else { 0 };
+                    gate(
+                        x,
                         u,
                         &old[i * hidden..][..hidden],
                         &mut now[r * hidden..][..hidden],
@@ -131,16 +188,19 @@ impl Operation<3> for Op {
         Ok((states, Shape::from((steps, rows, hidden))))
     }
 
-    fn backward(&self, [x, w, _]: [Arg<'_>; 3], states: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
-        let (steps, rows, hidden) = sizes(&x)?;
-        let triple = 3 * hidden;
+    fn backward(&self, [x, p]: [Arg<'_>; 2], states: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 2]> {
+        let (steps, rows) = self.steps_and_rows(&x)?;
+        let (Sizes { inputs, hidden }, triple, [w_x, b_x, w_h, b_h]) =
+            (self.sizes, self.sizes.triple(), self.sizes.ranges());
         let Some(saved) = self.saved.get() else { bail!("gru: gradient without forward") };
-        let transposed = self.packs.backward.get_or_init(|| Packed::transposed(w.values, hidden, triple));
-        // Gradients of the input projections and of the recurrent projections; they differ in the new gate only.
-        let mut dx = vec![0.0; steps * rows * triple];
-        let mut du = Buffer::take(TILE.min(rows) * triple);
+        let [to_input, to_state] = self.packs.backward.get_or_init(|| {
+            let [w_x, w_h] = [&p.values[w_x.clone()], &p.values[w_h.clone()]];
+            [Packed::transposed(w_x, inputs, triple), Packed::transposed(w_h, hidden, triple)]
+        });
+        let mut dx = Vec::with_capacity(steps * rows * inputs);
+        dx.resize(steps * rows * inputs, 0.0);
         let mut dh = Buffer::take(TILE.min(rows) * hidden);
-        let mut gradient = Gradient::new(hidden, triple);
+        let mut collected = Collected::new(self.sizes);
         let mut begun = Vec::new();
         for tile in tiles(rows) {
             let dh = &mut dh[..tile.len() * hidden];
@@ -151,21 +211,31 @@ impl Operation<3> for Op {
                     _ => &states[(t - 1) * rows * hidden..],
                 };
                 let before = &before[tile.start * hidden..tile.end * hidden];
-                let before = self.begun(before, t, (rows, hidden), &tile, &mut begun).unwrap_or(before);
-                for (i, r) in tile.clone().enumerate() {
-                    let at = t * rows + r;
+                let before = self.begun(before, t, rows, &tile, &mut begun).unwrap_or(before);
+                let at = t * rows + tile.start..t * rows + tile.end;
+                let inputs = at.start * inputs..at.end * inputs;
+                let (d_input, d_state) = collected.room(&x.values[inputs.clone()], before, tile.len());
+                for (i, at) in at.enumerate() {
                     gate_gradients(
                         &saved[at * 4 * hidden..][..4 * hidden],
                         &before[i * hidden..][..hidden],
                         &dy[at * hidden..][..hidden],
                         &mut dh[i * hidden..][..hidden],
-                        &mut dx[at * triple..][..triple],
-                        &mut du[i * triple..][..triple],
+                        &mut d_input[i * triple..][..triple],
+                        &mut d_state[i * triple..][..triple],
                     );
                 }
-                let du = Rows::new(&du[..tile.len() * triple], triple);
-                gradient.add(Rows::new(before, hidden), du, tile.len());
-                layer(du, transposed, Start::Output, Activation::Identity, dh, hidden, tile.len());
+                let (identity, count) = (Activation::Identity, tile.len());
+                layer(
+                    Rows::new(d_input, triple),
+                    to_input,
+                    Start::Zero,
+                    identity,
+                    &mut dx[inputs],
+                    self.sizes.inputs,
+                    count,
+                );
+                layer(Rows::new(d_state, triple), to_state, Start::Output, identity, dh, hidden, count);
                 // A sequence that began here has no step before.
                 if let Some(firsts) = self.firsts.get(t * rows + tile.start..t * rows + tile.end) {
                     for (row, _) in firsts.iter().enumerate().filter(|(_, first)| **first != 0) {
@@ -174,15 +244,71 @@ impl Operation<3> for Op {
                 }
             }
         }
-        let (mut dw, mut db) = (vec![0.0; hidden * triple], vec![0.0; triple]);
-        gradient.write(&mut dw, Some(&mut db));
-        Ok([Some(dx), Some(dw), Some(db)])
+        collected.add();
+        let mut d = vec![0.0; p.values.len()];
+        let [of_input, of_state] = &collected.gradients;
+        for (gradient, w, b) in [(of_input, w_x, b_x), (of_state, w_h, b_h)] {
+            let (dw, db) = d[w.start..b.end].split_at_mut(w.len());
+            gradient.write(dw, Some(db));
+        }
+        Ok([Some(dx), Some(d)])
+    }
+}
+
+/// Rows of several steps on their way into the gradient of the weights.
+struct Collected {
+    sizes: Sizes,
+    /// Of w_x and b_x, and of w_h and b_h.
+    gradients: [Gradient; 2],
+    /// [rows, I] and [rows, H]: what the weights were multiplied with.
+    inputs: Buffer,
+    states: Buffer,
+    /// [rows, 3H] gradients of both projections; they differ in the new gate only.
+    d_inputs: Buffer,
+    d_states: Buffer,
+    rows: usize,
+}
+
+impl Collected {
+    fn new(sizes: Sizes) -> Self {
+        let triple = sizes.triple();
+        Self {
+            sizes,
+            gradients: [Gradient::new(sizes.inputs, triple), Gradient::new(sizes.hidden, triple)],
+            inputs: Buffer::take(TOGETHER * sizes.inputs),
+            states: Buffer::take(TOGETHER * sizes.hidden),
+            d_inputs: Buffer::take(TOGETHER * triple),
+            d_states: Buffer::take(TOGETHER * triple),
+            rows: 0,
+        }
+    }
+
+    /// Takes in the inputs and states of some rows, and gives the places of their gradients.
+    fn room(&mut self, inputs: &[f32], states: &[f32], rows: usize) -> (&mut [f32], &mut [f32]) {
+        if self.rows + rows > TOGETHER {
+            self.add();
+        }
+        let (from, to) = (self.rows, self.rows + rows);
+        let (i, h, triple) = (self.sizes.inputs, self.sizes.hidden, self.sizes.triple());
+        self.inputs[from * i..to * i].copy_from_slice(inputs);
+        self.states[from * h..to * h].copy_from_slice(states);
+        self.rows = to;
+        (&mut self.d_inputs[from * triple..to * triple], &mut self.d_states[from * triple..to * triple])
+    }
+
+    /// Adds what has come together to the gradients.
+    fn add(&mut self) {
+        let (Sizes { inputs, hidden }, triple) = (self.sizes, self.sizes.triple());
+        let [of_input, of_state] = &mut self.gradients;
+        of_input.add(Rows::new(&self.inputs, inputs), Rows::new(&self.d_inputs, triple), self.rows);
+        of_state.add(Rows::new(&self.states, hidden), Rows::new(&self.d_states, triple), self.rows);
+        self.rows = 0;
     }
 }
 
 /// One row of one step: x and u [3H] are the projections of input and state.
 #[inline(always)]
-fn gates(x: &[f32], u: &[f32], old: &[f32], state: &mut [f32], keep: &mut [f32]) {
+fn gate(x: &[f32], u: &[f32], old: &[f32], state: &mut [f32], keep: &mut [f32]) {
     let hidden = old.len();
     for v in (0..hidden).step_by(LANES) {
         let reset = sigmoid(load(&x[v..]) + load(&u[v..]));

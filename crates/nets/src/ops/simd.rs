@@ -1,7 +1,8 @@
 //! Loads and stores for the vector type. One vector is always sixteen lanes, whatever the machine's registers are, so
 //! that a result does not depend on the instruction set (fused multiply-add is required: x86-64-v3 or AArch64).
 
-use wide::{f32x16, i32x16};
+use super::matmul::Rows;
+use wide::{f32x8, f32x16, i32x16};
 
 pub(crate) const LANES: usize = 16;
 
@@ -47,6 +48,49 @@ pub(crate) fn sum(value: f32x16) -> f32 {
     (quarter[0] + quarter[2]) + (quarter[1] + quarter[3])
 }
 
+/// [`sum`] of each of several vectors, with the same bits, eight at a time.
+#[inline(always)]
+pub(crate) fn sums(values: &[f32x16], out: &mut [f32]) {
+    let (eights, rest) = values.as_chunks::<8>();
+    let (out_eights, out_rest) = out.as_chunks_mut::<8>();
+    for (eight, out) in eights.iter().zip(out_eights) {
+        let halves = eight.map(|value| {
+            let lanes = value.to_array();
+            let (low, high) = lanes.split_at(8);
+            let half = |lanes: &[f32]| lanes.first_chunk().map_or(f32x8::ZERO, |lanes| f32x8::new(*lanes));
+            half(low) + half(high)
+        });
+        let half = f32x8::transpose(halves);
+        let quarter: [f32x8; 4] = std::array::from_fn(|i| half[i] + half[i + 4]);
+        *out = ((quarter[0] + quarter[2]) + (quarter[1] + quarter[3])).to_array();
+    }
+    out_rest.iter_mut().zip(rest).for_each(|(out, value)| *out = sum(*value));
+}
+
+/// out [columns, stride] gets the transpose of the first `rows` rows and `columns` columns of x; what is beyond them stays.
+#[inline(always)]
+pub(crate) fn transpose(x: Rows<'_>, rows: usize, columns: usize, out: &mut [f32], stride: usize) {
+    let (whole_rows, whole_columns) = (rows / 8 * 8, columns / 8 * 8);
+    for row in (0..whole_rows).step_by(8) {
+        for column in (0..whole_columns).step_by(8) {
+            let line = |i: usize| {
+                let from = x.values.get((row + i) * x.stride + column..).and_then(|from| from.first_chunk());
+                from.map_or(f32x8::ZERO, |from| f32x8::new(*from))
+            };
+            let block = f32x8::transpose(std::array::from_fn(line));
+            for (i, line) in block.into_iter().enumerate() {
+                let at = (column + i) * stride + row;
+                out[at..at + 8].copy_from_slice(&line.to_array());
+            }
+        }
+    }
+    for row in 0..rows {
+        for column in if row < whole_rows { whole_columns } else { 0 }..columns {
+            out[column * stride + row] = x.values[row * x.stride + column];
+        }
+    }
+}
+
 /// eˣ for |x| ≤ 87, within 2 units in the last place: `wide`'s takes three times as long, because it looks after infinities,
 /// subnormal numbers and NaN (which stays NaN here, too).
 #[inline(always)]
@@ -74,6 +118,34 @@ pub(crate) fn exp_of_negative(x: f32x16) -> f32x16 {
     exp_within(f32x16::splat(-87.0).fast_max(x))
 }
 
+/// ln x of positive normal numbers, within 2 units in the last place of 1 or of the result: `wide`'s looks after all others, too.
+#[inline(always)]
+pub(crate) fn ln_of_normal(x: f32x16) -> f32x16 {
+    // x = 2ᵉ m with m between √½ and √2.
+    let bits = wide::bytemuck::cast::<f32x16, i32x16>(x);
+    let e = (bits - i32x16::splat(0x3f35_04f3)) >> 23;
+    let m = wide::bytemuck::cast::<i32x16, f32x16>(bits - (e << 23));
+    let (e, f) = (f32x16::from_i32x16(e), m - f32x16::ONE);
+    // The polynomial of Cephes' logf (Moshier).
+    let mut p = f32x16::splat(7.037_683_6e-2);
+    for c in [
+        -0.115_146_1,
+        0.116_769_99,
+        -0.124_201_41,
+        0.142_493_23,
+        -0.166_680_58,
+        0.200_007_14,
+        -0.249_999_94,
+        0.333_333_31,
+    ] {
+        p = p.mul_add(f, f32x16::splat(c));
+    }
+    let square = f * f;
+    let tail = e.mul_add(f32x16::splat(-2.121_944_4e-4), square * f * p);
+    let near = square.mul_add(f32x16::splat(-0.5), f) + tail;
+    e.mul_add(f32x16::splat(0.693_359_4), near)
+}
+
 /// Logistic function.
 #[inline(always)]
 pub(crate) fn sigmoid(x: f32x16) -> f32x16 {
@@ -93,6 +165,33 @@ pub(crate) fn tanh(x: f32x16) -> f32x16 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sums_of_many_vectors_have_the_bits_of_one_and_blocks_transpose() {
+        let numbers: Vec<f32> = (0..21 * 29).map(|i| libm::sinf(i as f32 * 1.7)).collect();
+        let vectors: Vec<f32x16> = numbers.chunks_exact(LANES).take(21).map(load).collect();
+        let mut out = [0.0; 21];
+        sums(&vectors, &mut out);
+        assert_eq!(out.to_vec(), vectors.iter().map(|v| sum(*v)).collect::<Vec<f32>>());
+        let mut turned = vec![-1.0; 27 * 24];
+        transpose(Rows::new(&numbers, 29), 21, 27, &mut turned, 24);
+        for column in 0..27 {
+            for row in 0..24 {
+                let expected = if row < 21 { numbers[row * 29 + column] } else { -1.0 };
+                assert_eq!(turned[column * 24 + row], expected);
+            }
+        }
+    }
+
+    #[test]
+    fn the_short_logarithm_is_close_everywhere() {
+        for i in 0..60_000 {
+            let x = libm::expf((i - 30_000) as f32 * 0.002_8);
+            let (ours, exact) = (f64::from(ln_of_normal(f32x16::splat(x)).to_array()[5]), libm::log(f64::from(x)));
+            assert!((ours - exact).abs() <= 2.0e-7 * exact.abs().max(1.0), "{x}: {ours} and {exact}");
+        }
+        assert_eq!(ln_of_normal(f32x16::ONE).to_array(), [0.0; LANES]);
+    }
 
     #[test]
     fn the_short_exponential_is_close_everywhere_and_keeps_what_is_no_number() {

@@ -14,7 +14,7 @@ use magex_core::task::{Spawn, TaskConfig, TaskName};
 use magex_nets::distribution::ActionHeads;
 use magex_nets::executor::{Input, build, feature_spec};
 use magex_nets::ops::{self, Activation, GraphBlock, GraphNoise};
-use magex_nets::params::{ParamBuilder, Params};
+use magex_nets::params::{Init, ParamBuilder, Params};
 use std::sync::Arc;
 use support::{check, normal, probe, var};
 
@@ -82,29 +82,67 @@ fn mixing_distances_and_elu() {
     assert!(gap.max_all().unwrap().to_scalar::<f32>().unwrap() < 1e-6);
 }
 
+/// A unit of 16 on 5 inputs whose parameters stand one after the other in `parameters`.
+fn unit(parameters: &Var) -> ops::Gru {
+    let mut builder = ParamBuilder::with(vec![parameters.as_tensor().clone()]);
+    ops::Gru::build("gru", (5, 16), [Init::Constant(0.0); 4], &mut builder).unwrap()
+}
+
 #[test]
 fn recurrent_unit() {
-    let (x, w, b) = (var(&[4, 3, 48], 1), var(&[16, 48], 2), var(&[48], 3));
-    let w = Var::from_tensor(&(w.as_tensor() * 0.3).unwrap()).unwrap();
-    let h0 = normal(3 * 16, 4);
-    check(&[&x, &w, &b], &|| {
-        let unit = ops::Gru::new(w.as_tensor().clone(), b.as_tensor().clone());
-        unit.forward(&x, h0.clone(), Vec::new()).unwrap()
-    });
+    let (x, h0) = (var(&[4 * 3, 5], 1), normal(3 * 16, 4));
+    let p = var(&[5 * 48 + 48 + 16 * 48 + 48], 2);
+    let p = Var::from_tensor(&(p.as_tensor() * 0.3).unwrap()).unwrap();
+    check(&[&x, &p], &|| unit(&p).forward(&x, h0.clone(), Vec::new()).unwrap());
     // Sequences that begin anew: at the first step, in the middle, at the last one.
     let mut firsts = vec![0; 4 * 3];
     [2, 3, 7, 9].into_iter().for_each(|place| firsts[place] = 1);
-    let unit = || ops::Gru::new(w.as_tensor().clone(), b.as_tensor().clone());
-    check(&[&x, &w, &b], &|| unit().forward(&x, h0.clone(), firsts.clone()).unwrap());
+    check(&[&x, &p], &|| unit(&p).forward(&x, h0.clone(), firsts.clone()).unwrap());
     // They are those of a sequence of their own.
-    let whole = unit().forward(&x, h0.clone(), firsts).unwrap();
-    let own = unit().forward(
-        &x.narrow(0, 1, 3).unwrap().narrow(1, 0, 1).unwrap().contiguous().unwrap(),
-        vec![0.0; 16],
-        Vec::new(),
-    );
-    let two = |x: &Tensor| x.narrow(0, 0, 2).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    assert_eq!(two(&whole.narrow(0, 1, 2).unwrap().narrow(1, 0, 1).unwrap().contiguous().unwrap()), two(&own.unwrap()));
+    let whole = unit(&p).forward(&x, h0.clone(), firsts).unwrap();
+    let rows = Tensor::cat(&[x.narrow(0, 3, 1).unwrap(), x.narrow(0, 6, 1).unwrap()], 0).unwrap();
+    let own = unit(&p).forward(&rows, vec![0.0; 16], Vec::new()).unwrap();
+    let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(numbers(&whole.narrow(0, 1, 2).unwrap().narrow(1, 0, 1).unwrap()), numbers(&own));
+    assert!(unit(&p).forward(&x, vec![0.0; 17], Vec::new()).is_err());
+    assert!(unit(&p).forward(&x, vec![0.0; 5 * 16], Vec::new()).is_err());
+}
+
+/// More rows than pass through the steps at once, and more steps than the gradient of the weights takes in at once.
+#[test]
+fn recurrent_unit_as_candle_computes_it() {
+    let (steps, rows, inputs, hidden) = (7, 101, 5, 16);
+    let (x, h0) = (var(&[steps * rows, inputs], 1), normal(rows * hidden, 4));
+    let p = var(&[5 * 48 + 48 + 16 * 48 + 48], 2);
+    let p = Var::from_tensor(&(p.as_tensor() * 0.3).unwrap()).unwrap();
+    let weight = var(&[steps, rows, hidden], 3);
+    let ours = unit(&p).forward(&x, h0.clone(), Vec::new()).unwrap();
+    let part =
+        |from: usize, shape: (usize, usize)| p.narrow(0, from, shape.0 * shape.1).unwrap().reshape(shape).unwrap();
+    let (w_x, b_x, w_h, b_h) = (part(0, (5, 48)), part(240, (1, 48)), part(288, (16, 48)), part(1056, (1, 48)));
+    let mut h = Tensor::from_vec(h0, (rows, hidden), &Device::Cpu).unwrap();
+    let mut states = Vec::new();
+    for t in 0..steps {
+        let x = x.narrow(0, t * rows, rows).unwrap();
+        let of_input = x.matmul(&w_x).unwrap().broadcast_add(&b_x).unwrap().chunk(3, 1).unwrap();
+        let of_state = h.matmul(&w_h).unwrap().broadcast_add(&b_h).unwrap().chunk(3, 1).unwrap();
+        let gate = |at: usize| candle_nn::ops::sigmoid(&(&of_input[at] + &of_state[at]).unwrap()).unwrap();
+        let (reset, update) = (gate(0), gate(1));
+        let new = (&of_input[2] + (reset * &of_state[2]).unwrap()).unwrap().tanh().unwrap();
+        h = (&new + (update * (h - &new).unwrap()).unwrap()).unwrap();
+        states.push(h.clone());
+    }
+    let theirs = Tensor::stack(&states, 0).unwrap();
+    let gap = |a: &Tensor, b: &Tensor| (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(gap(&ours, &theirs) < 2e-6, "{}", gap(&ours, &theirs));
+    let gradients = |y: &Tensor| {
+        let store = (y * weight.as_tensor()).unwrap().sum_all().unwrap().backward().unwrap();
+        [&x, &p].map(|of| store.get(of.as_tensor()).unwrap().clone())
+    };
+    for (ours, theirs) in gradients(&ours).iter().zip(&gradients(&theirs)) {
+        let size = theirs.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!(gap(ours, theirs) < 2e-6 * size, "{} of {size}", gap(ours, theirs));
+    }
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! The way back through a graph block.
 
 use super::{Op, Saved};
-use crate::ops::simd::{LANES, load, sigmoid, store, sum};
+use crate::ops::matmul::Rows;
+use crate::ops::simd::{self, LANES, load, sigmoid, store, sum, transpose};
 use wide::f32x16;
 
 impl Op {
@@ -17,74 +18,61 @@ impl Op {
         let states = features.len() / (n * columns);
         let mut scratch = self.scratch();
         let padded = scratch.padded;
+        // Zeros: the gradients of z are sums over edges.
         let (mut all_d_features, mut d_relative) = (vec![0.0; features.len()], vec![0.0; relative.len()]);
-        let (mut z, mut d_z) = (vec![0.0; width * padded], vec![0.0; n * width]);
-        let (mut g, mut d_logits) = (vec![0.0; width], vec![0.0; padded]);
+        let (mut z, mut d_logits) = (vec![0.0; width * padded], vec![0.0; padded]);
+        let mut g = vec![0.0; width];
         let mut sums = PairSums::new(p, padded);
+        let (mut d_score, mut all) = (vec![0.0f32; p + 1], vec![0.0; p]);
+        let (mut scaled, mut d_receiver) = (vec![0.0; p * padded], vec![0.0; padded * p]);
         for s in 0..states {
             let features = &features[s * n * columns..(s + 1) * n * columns];
             let d_features = &mut all_d_features[s * n * columns..(s + 1) * n * columns];
+            let d_relative = &mut d_relative[s * n * p..(s + 1) * n * p];
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
-            for j in 0..n {
-                for k in 0..width {
-                    z[k * padded + j] = features[j * columns + 2 * p + k];
-                }
-            }
+            transpose(Rows::new(features, columns).skip(2 * p), n, width, &mut z, padded);
             sums.receiver.fill(f32x16::ZERO);
-            d_z.fill(0.0);
             for i in 0..n {
                 let row = s * n + i;
                 let logits = &saved.logits[row * padded..(row + 1) * padded];
                 let message = &saved.messages[row * width..(row + 1) * width];
-                let degree = self.edges(i, logits, |_| {});
-                let inverse = 1.0 / degree.max(1) as f32;
-                let at = row * width;
-                let mut through_mean = 0.0;
-                for k in 0..width {
-                    let d = if y[at + k] > 0.0 { dy[at + k] } else { 0.0 };
-                    if self.block.self_path {
-                        d_features[i * columns + 2 * p + width + k] = d;
-                    }
-                    g[k] = d * inverse;
-                    through_mean += g[k] * message[k];
-                }
-                self.edges(i, logits, |j| {
-                    for (d, g) in d_z[j * width..(j + 1) * width].iter_mut().zip(&g) {
-                        *d += g;
-                    }
-                });
-                if degree == 0 {
-                    through_mean = 0.0;
-                }
+                let degree = self.degree(i, logits);
+                let at = row * width..(row + 1) * width;
+                let own =
+                    &mut d_features[i * columns + 2 * p + width..][..if self.block.self_path { width } else { 0 }];
+                let through_mean = message_gradient((&y[at.clone()], &dy[at], message), degree, &mut g, own);
+                self.edges(i, logits, |j| add(&g, &mut d_features[j * columns + 2 * p..][..width]));
                 self.edge_gradients(logits, &z, &g, through_mean, &mut d_logits);
                 // Neither an agent itself nor what fills up the last vector is a neighbour.
                 d_logits[i] = 0.0;
                 d_logits[n..].fill(0.0);
-                sums.row(&scratch.sender[i * p..(i + 1) * p], &scratch.receiver, &d_logits);
+                let sender = &scratch.sender[i * p..(i + 1) * p];
+                sums.row(sender, &scratch.receiver, &d_logits);
+                simd::sums(&sums.sender, &mut all);
+                let (d_u, d_q) = (&mut d_features[i * columns..][..p], &mut d_relative[i * p..][..p]);
                 for k in 0..p {
-                    let d = score[k] * sum(sums.sender[k]);
-                    d_features[i * columns + k] = d;
-                    d_relative[row * p + k] = -d;
+                    d_score[k] = sender[k].mul_add(all[k], d_score[k]);
+                    d_u[k] = score[k] * all[k];
+                    d_q[k] = -d_u[k];
                 }
             }
-            for k in 0..p {
-                for v in (0..padded).step_by(LANES) {
-                    for (lane, d) in sums.receiver[(k * padded + v) / LANES].to_array().into_iter().enumerate() {
-                        let j = v + lane;
-                        if j < n {
-                            let d = score[k] * d;
-                            d_features[j * columns + p + k] = d;
-                            d_relative[(s * n + j) * p + k] += d;
-                        }
-                    }
+            for (k, (d, receiver)) in
+                sums.receiver.chunks_exact(padded / LANES).zip(scratch.receiver.chunks_exact(padded)).enumerate()
+            {
+                for (v, d) in d.iter().enumerate() {
+                    let at = v * LANES;
+                    sums.score[k] = load(&receiver[at..]).mul_add(*d, sums.score[k]);
+                    store(*d * f32x16::splat(score[k]), &mut scaled[k * padded + at..]);
                 }
             }
-            for j in 0..n {
-                d_features[j * columns + 2 * p..j * columns + 2 * p + width]
-                    .copy_from_slice(&d_z[j * width..(j + 1) * width]);
+            transpose(Rows::new(&scaled, padded), p, padded, &mut d_receiver, p);
+            for (j, d) in d_receiver.chunks_exact(p).take(n).enumerate() {
+                d_features[j * columns + p..][..p].copy_from_slice(d);
+                add(d, &mut d_relative[j * p..][..p]);
             }
         }
-        [all_d_features, d_relative, sums.score.into_iter().map(sum).collect()]
+        d_score.iter_mut().zip(sums.score).for_each(|(d, receivers)| *d += sum(receivers));
+        [all_d_features, d_relative, d_score]
     }
 
     /// d a_ij = g_i · (z_j − mean message), then through σ'((logit + noise) / τ), for the edges of one agent.
@@ -131,13 +119,40 @@ impl Op {
     }
 }
 
+/// Through relu(self_i + mean message): the gradient of one message in `g`, that of the agent's own features in `own` (which may be
+/// empty), and Σ g · mean message, which the number of edges takes away from each of them.
+#[inline(always)]
+fn message_gradient((y, dy, message): (&[f32], &[f32], &[f32]), degree: usize, g: &mut [f32], own: &mut [f32]) -> f32 {
+    let inverse = f32x16::splat(1.0 / degree.max(1) as f32);
+    let mut through_mean = f32x16::ZERO;
+    for at in (0..g.len()).step_by(LANES) {
+        let d = load(&y[at..]).simd_gt(f32x16::ZERO) & load(&dy[at..]);
+        if let Some(own) = own.get_mut(at..) {
+            store(d, own);
+        }
+        let d = d * inverse;
+        through_mean = d.mul_add(load(&message[at..]), through_mean);
+        store(d, &mut g[at..]);
+    }
+    if degree == 0 { 0.0 } else { sum(through_mean) }
+}
+
+/// to += d.
+#[inline(always)]
+fn add(d: &[f32], to: &mut [f32]) {
+    for (d, to) in d.chunks(LANES).zip(to.chunks_mut(LANES)) {
+        store(load(to) + load(d), to);
+    }
+}
+
 /// Gradients of the pair network w2 · relu(u_i + v_j) + b2. Those of u and v lack the factor w2, which is the same for a whole sum.
 struct PairSums {
     /// `[P]` of u_i, over all j: the current row's.
     sender: Vec<f32x16>,
     /// [P, padded / 16] of v_j, over all i.
     receiver: Vec<f32x16>,
-    /// [P + 1] of w2 and b2.
+    /// [P + 1] of w2 and b2. Where u_i + v_j > 0, an edge adds d · (u_i + v_j) to that of w2, so the sum over all edges is
+    /// Σ u · du + Σ v · dv, and only the second part of it stands here.
     score: Vec<f32x16>,
 }
 
@@ -172,15 +187,12 @@ impl PairSums {
             self.score[p] += d;
         }
         let receivers = receiver.chunks_exact(padded).zip(self.receiver.chunks_exact_mut(padded / LANES));
-        for (((u, d_u), d_s), (receiver, d_receiver)) in
-            sender.iter().zip(&mut self.sender).zip(&mut self.score).zip(receivers)
-        {
+        for ((u, d_u), (receiver, d_receiver)) in sender.iter().zip(&mut self.sender).zip(receivers) {
             let (u, receiver, first) = (f32x16::splat(*u), &receiver[v..v + Q * LANES], v / LANES);
             let d_receiver = &mut d_receiver[first..first + Q];
             for q in 0..Q {
                 let hidden = u + load(&receiver[q * LANES..]);
                 let through = d[q] & hidden.simd_gt(f32x16::ZERO);
-                *d_s = through.mul_add(hidden, *d_s);
                 *d_u += through;
                 d_receiver[q] += through;
             }
