@@ -22,7 +22,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Format of the folder; readers reject any other.
-pub const FORMAT: u32 = 3;
+pub const FORMAT: u32 = 4;
 
 /// Why a checkpoint could not be written or read.
 #[derive(Debug, thiserror::Error)]
@@ -76,8 +76,9 @@ fn in_file<R: ToString>(path: &Path) -> impl FnOnce(R) -> CheckpointError + use<
 fn writer(format: u32) -> &'static str {
     match format {
         1 => "magex 0.1.0 (commit 389f705)",
-        // The same files; what is computed on from them has other bits.
+        // These two have the same files; what is computed on from them has other bits.
         2 => "magex 0.2.0 (commit aa62ae4 or before)",
+        3 => "magex 0.2.0 (commit e39ac1d or before)",
         _ => "another release of magex",
     }
 }

@@ -38,7 +38,7 @@ pub const LEARNER: &str = "learner";
 pub const COMMANDER: &str = "commander";
 
 /// Version of the protocol that this build speaks; both sides of a handshake must agree on it.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;
 
 /// Longest message that any side decodes, bytes.
 pub const MAX_MESSAGE_BYTES: usize = 2 << 20;

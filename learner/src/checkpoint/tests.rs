@@ -71,7 +71,11 @@ fn a_folder_of_a_format_before_is_rejected_by_name() {
     let state = learned();
     let folder = write(run.path(), &progress(1), &state, 3).unwrap();
     check_format(run.path()).unwrap();
-    for (format, writer) in [(2, "0.2.0 (commit aa62ae4 or before)"), (1, "0.1.0 (commit 389f705)")] {
+    for (format, writer) in [
+        (3, "0.2.0 (commit e39ac1d or before)"),
+        (2, "0.2.0 (commit aa62ae4 or before)"),
+        (1, "0.1.0 (commit 389f705)"),
+    ] {
         fs::write(folder.join(MANIFEST), format!("{{\"format\": {format}, \"sha256\": {{}}}}")).unwrap();
         // Damage, as long as it is in one file only.
         check_format(run.path()).unwrap();

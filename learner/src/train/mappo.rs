@@ -51,6 +51,9 @@ type Functions = (Box<dyn Policy>, Box<dyn nets::Network>);
 /// Rows of one pass of a network without memory, about: a longer pass gains nothing, and some need much room for one.
 const AT_ONCE: usize = 2048;
 
+/// Rows of a slice of a minibatch, at least: with fewer ones the operations cost more than what they compute.
+const SLICE_ROWS: usize = 1024;
+
 /// The algorithm with its settings.
 #[derive(Debug)]
 pub struct Mappo {
@@ -178,7 +181,8 @@ impl Mappo {
 
                 // 5. Gradients of both losses, slice by slice.
                 let (policy, value) = (self.policy(networks)?, self.value(networks)?);
-                let count = m.gradient_slices.min(units.len());
+                let worth_it = (units.len() * self.chunk * n / SLICE_ROWS).max(1);
+                let count = m.gradient_slices.min(units.len()).min(worth_it);
                 let slice = |s| Slice { batch, units: &units[part(units.len(), count, s)], chunk: self.chunk, samples };
                 let slices: Vec<Slice<'_>> = (0..count).map(slice).collect();
                 let losses = |s: &Slice<'_>| {

@@ -74,7 +74,7 @@ impl Gru {
 }
 
 /// Rows that pass through all steps before the next ones do: their state stays in the first cache levels.
-const TILE: usize = 48;
+const TILE: usize = 96;
 
 /// Rows of several steps that the gradient of the weights takes in at once: each pass reads and writes all of its sums.
 const TOGETHER: usize = 96;
