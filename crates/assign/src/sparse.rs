@@ -6,12 +6,14 @@
 //! candidates. The steps are a first guess of the prices from a quarter of the rows and columns, solved in the same way; an
 //! auction with falling ε (Bertsekas 1988), which finds nearly the final prices; and shortest augmenting paths, which make them
 //! final. [`crate::ties`] makes the answer the lowest of the exact optima, so the answer depends on none of these steps.
+//! Where many points are at the same places, [`places`] counts them instead.
 
 mod auction;
 mod candidates;
 mod costs;
 mod line;
 mod pairs;
+mod places;
 mod points;
 mod search;
 mod start;

@@ -94,6 +94,11 @@ impl OwnCosts {
         pairs.binary_search_by_key(&(col as u32), |pair| pair.col).ok().map(|place| &pairs[place])
     }
 
+    /// With rows for columns; there are `rows` of these.
+    pub(super) fn turned(&self, rows: usize) -> Self {
+        Self::new(self.pairs.iter().map(|pair| OwnCost { row: pair.col, col: pair.row, ..*pair }).collect(), rows)
+    }
+
     /// The same with other numbers for rows and columns.
     pub(super) fn places(&self, row_at: &[u32], place_of_col: &[u32]) -> Self {
         let mut pairs = Vec::with_capacity(self.pairs.len());

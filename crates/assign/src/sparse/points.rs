@@ -3,7 +3,7 @@
 mod source;
 
 use super::costs::{Metric, OwnCost, OwnCosts};
-use super::{line, solve};
+use super::{line, places, solve};
 use crate::points::{check_points, check_power};
 use crate::ties::Exact;
 use crate::{AssignError, Assignment, LARGEST_COST, Solver, Span, Switching, UNASSIGNED, compensated_sum, costs_into};
@@ -50,9 +50,13 @@ impl<'a, T> PointProblem<'a, T> {
 /// Points on a line along an axis (as many agents as goals, power 1, no costs of their own and no pairs in force, and
 /// differences of coordinates that are doubles) take n log n steps, although nearly all their pairs are equally good.
 ///
+/// Where several points share a place, with equal coordinates and without costs of their own or pairs in force, their number is
+/// what takes time, not their pairs: many points of few places are solved faster than as many places.
+///
 /// The one exception to the last two keys of the order, and to sums without rounding: where more than 2^25 pairs in all are
-/// equally good within 10^-12 of the largest costs (more than 5,792 points on an oblique line, on any line with unequal
-/// numbers, or in one place with unequal numbers), the answer is as cheap as doubles can tell and deterministic, but not always the lowest one.
+/// equally good within 10^-12 of the largest costs (more than 5,792 points on an oblique line, or on any line with unequal
+/// numbers), the answer is as cheap as doubles can tell and deterministic, but not always the lowest one. Where points share
+/// places so often that these are counted (four points for each place of one side, or two of both), pairs of places count.
 pub fn solve_points<T: Copy + Into<f64>>(
     problem: &PointProblem<'_, T>,
     should_continue: &dyn Fn() -> bool,
@@ -152,19 +156,19 @@ fn solve_dims<const D: usize>(
     let (largest_cost, sink) = largest_costs(&own, agents, goals, metric)?;
     let sink = sink.filter(|_| !limit.complete);
     let (short, long) = if turned { (goals, agents) } else { (agents, goals) };
-    let (source, order) = Points::new(short, long, metric, &own, largest_cost, sink);
     let exact = PointCosts { from: short, to: long, metric, own: &own, sink: sink.unwrap_or(0.0), turned };
+    let counted = places::Problem { short, long, metric, own: &own, largest_cost, sink, turned };
+    if let Some(goal_of) = places::solve(&counted, should_continue)? {
+        return Ok(Assignment { cost: exact.sum(&goal_of), col_of_row: goal_of });
+    }
+    let (source, order) = Points::new(short, long, metric, &own, largest_cost, sink);
     let col_of_row = solve(source, &order, &exact, should_continue)?;
     let mut goal_of = vec![UNASSIGNED; rows];
     for (row, &col) in (0u32..).zip(&col_of_row).filter(|(_, col)| (**col as usize) < long.len()) {
         let (agent, goal) = if turned { (col, row) } else { (row, col) };
         goal_of[agent as usize] = goal;
     }
-    let cost = compensated_sum(crate::pairs(&goal_of).map(|(agent, goal)| {
-        let (row, col) = if turned { (goal, agent) } else { (agent, goal) };
-        exact.terms(row, col)[0]
-    }));
-    Ok(Assignment { col_of_row: goal_of, cost })
+    Ok(Assignment { cost: exact.sum(&goal_of), col_of_row: goal_of })
 }
 
 /// The search is no generic code of the callers', whose profile may not optimise it.
@@ -233,6 +237,16 @@ struct PointCosts<'a, const D: usize> {
     own: &'a OwnCosts,
     sink: f64,
     turned: bool,
+}
+
+impl<const D: usize> PointCosts<'_, D> {
+    /// Of the goals of all agents.
+    fn sum(&self, goal_of: &[u32]) -> f64 {
+        compensated_sum(crate::pairs(goal_of).map(|(agent, goal)| {
+            let (row, col) = if self.turned { (goal, agent) } else { (agent, goal) };
+            self.terms(row, col)[0]
+        }))
+    }
 }
 
 impl<const D: usize> Exact for PointCosts<'_, D> {

@@ -2,7 +2,7 @@ use super::candidates::Engine;
 use super::costs::{Metric, OwnCosts};
 use super::pairs::{AllowedPairs, solve_pairs};
 use super::points::{Limit, PointProblem, Points, check, matrix, solve_sparse};
-use super::threshold::{Matching, bottleneck_sparse};
+use super::threshold::{Growing, Matching, bottleneck_sparse};
 use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
 use magex_core::rng::{Key, Purpose, Stream};
 
@@ -112,8 +112,8 @@ fn points_and_pairs_have_the_answers_of_the_matrix() {
 
 #[test]
 fn without_a_matrix_a_solver_that_is_told_to_stop_stops() {
-    let points: Vec<f64> = (0..2400).map(|k| f64::from(k * k % 97)).collect();
-    let problem = PointProblem::new(&points, &points, 2);
+    // Many points that are the same, and few.
+    let [same, others] = [97, 9973].map(|few| -> Vec<f64> { (0..2400).map(|k| f64::from(k * k % few)).collect() });
     let stop = |calls: u32| {
         let left = std::cell::Cell::new(calls);
         move || {
@@ -121,9 +121,12 @@ fn without_a_matrix_a_solver_that_is_told_to_stop_stops() {
             left.get() > 0
         }
     };
-    for calls in [1, 3, 50] {
-        assert_eq!(super::solve_points(&problem, &stop(calls)), Err(crate::AssignError::Interrupted));
-        assert_eq!(super::bottleneck_points(&problem, &stop(calls.min(3))), Err(crate::AssignError::Interrupted));
+    for points in [same, others] {
+        let problem = PointProblem::new(&points, &points, 2);
+        for calls in [1, 3, 50] {
+            assert_eq!(super::solve_points(&problem, &stop(calls)), Err(crate::AssignError::Interrupted));
+            assert_eq!(super::bottleneck_points(&problem, &stop(calls.min(2))), Err(crate::AssignError::Interrupted));
+        }
     }
 }
 
@@ -247,5 +250,5 @@ fn a_bottleneck_is_found_with_few_looks_per_agent() {
     let mut matching = Matching::new(&agents, &goals, metric, &OwnCosts::default());
     matching.search(&|| true).unwrap();
     // 97; a bisection that forgets its matching, or its rounds, is far above.
-    assert!(matching.looks <= 150 * agents.len(), "{} looks", matching.looks);
+    assert!(matching.seeker.looks <= 150 * agents.len(), "{} looks", matching.seeker.looks);
 }

@@ -5,10 +5,11 @@
 //! every column once (Efrat, Itai & Katz 2001, "Geometry helps in bottleneck matching"). Where it is not enough, the cheapest
 //! pair that leads out of what was reached is the next candidate.
 
-use super::NONE;
 use super::costs::{Metric, OwnCost, OwnCosts};
+use super::places::{Counted, Shares};
 use super::points::{Limit, PointProblem, WORTH_IT, check, in_doubles, matrix, own_costs, solve_sparse};
 use super::tree::Tree;
+use super::{NONE, Order};
 use crate::{AssignError, Assignment, BottleneckSolver, UNASSIGNED, pairs};
 
 /// As many pairs as possible, then the smallest largest cost, then as [`super::solve_points`]: the answer of
@@ -56,68 +57,53 @@ fn threshold<const D: usize>(
     let (agents, goals) = (problem.agents.as_chunks::<D>().0, problem.goals.as_chunks::<D>().0);
     let own = own_costs(problem, agents, goals, metric);
     let (short, long) = if agents.len() > goals.len() { (goals, agents) } else { (agents, goals) };
-    Matching::new(short, long, metric, &own).search(should_continue)
-}
-
-/// A matching of pairs up to a threshold.
-pub(super) struct Matching<const D: usize> {
-    from: Vec<[f64; D]>,
-    /// Columns that a round has not met yet, and those of them without a row.
-    left: Tree<D>,
-    free: Tree<D>,
-    metric: Metric,
-    own: OwnCosts,
-    col_of_row: Vec<u32>,
-    row_of_col: Vec<u32>,
-    /// Rows that the last round has reached in vain.
-    reached: Vec<u32>,
-    /// How often a row looked for a column.
-    pub(super) looks: usize,
-}
-
-impl<const D: usize> Matching<D> {
-    /// Without pairs; no more points `from` than points `to`.
-    pub(super) fn new(from: &[[f64; D]], to: &[[f64; D]], metric: Metric, own: &OwnCosts) -> Self {
-        let (tree, col_at) = Tree::new(to);
-        let (_, row_at) = Tree::new(from);
-        let mut place_of_col = vec![0; to.len()];
-        (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
-        Self {
-            from: row_at.iter().map(|&row| from[row as usize]).collect(),
-            free: tree.clone(),
-            left: tree,
-            metric,
-            own: own.places(&row_at, &place_of_col),
-            col_of_row: vec![NONE; from.len()],
-            row_of_col: vec![NONE; to.len()],
-            reached: Vec::new(),
-            looks: 0,
-        }
+    match Counted::new(short, long, &own) {
+        Some(counted) => Shares::new(&counted, metric).search(should_continue),
+        None => Matching::new(short, long, metric, &own).search(should_continue),
     }
+}
 
-    pub(super) fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
-        let rows = self.from.len();
-        // The dearest of the rows' cheapest pairs is a lower bound.
-        let mut low = f64::NEG_INFINITY;
+/// A largest matching of pairs up to a threshold, which changes.
+pub(super) trait Growing<const D: usize> {
+    fn seeker(&mut self) -> &mut Seeker<D>;
+    /// Pairs of the whole shorter side.
+    fn whole(&self) -> usize;
+    /// Whether the rows are that side.
+    fn rows_are_shorter(&self) -> bool;
+    /// Makes the matching a largest one of pairs up to the limit; returns its size.
+    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError>;
+    /// Rows that the last round has reached in vain.
+    fn reached(&mut self) -> &mut Vec<u32>;
+    /// The dearest pair.
+    fn largest(&mut self) -> f64;
+
+    /// The smallest largest cost.
+    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
+        let (rows, whole) = (self.seeker().from.len(), self.whole());
+        // The dearest of the rows' cheapest pairs is a lower bound if all rows need one, the cheapest otherwise.
+        let (mut low, mut least) = (f64::NEG_INFINITY, f64::INFINITY);
         let mut complete = true;
         for row in 0..rows as u32 {
-            match self.cheapest(row) {
-                Some(cost) => low = low.max(cost),
+            match self.seeker().cheapest(row) {
+                Some(cost) => (low, least) = (low.max(cost), least.min(cost)),
                 None => complete = false,
             }
         }
         if low == f64::NEG_INFINITY {
             return Ok(None);
         }
-        let target = if self.own.is_empty() && complete {
-            rows
+        if !self.rows_are_shorter() {
+            low = least;
+        }
+        let target = if self.seeker().own.is_empty() && complete {
+            whole
         } else {
             let pairs = self.grow(f64::INFINITY, should_continue)?;
-            if pairs < rows {
+            if pairs < whole {
                 // Some rows stay without a column: their cheapest pairs say nothing.
                 low = f64::NEG_INFINITY;
                 for row in 0..rows as u32 {
-                    if let Some(cost) = self.cheapest(row) {
+                    if let Some(cost) = self.seeker().cheapest(row) {
                         low = if low == f64::NEG_INFINITY { cost } else { low.min(cost) };
                     }
                 }
@@ -139,68 +125,51 @@ impl<const D: usize> Matching<D> {
                 limit = low;
             }
         }
-        Ok(Some(Limit { cost: high, complete: target == rows }))
+        Ok(Some(Limit { cost: high, complete: target == whole }))
     }
 
-    /// Makes the matching a largest one of pairs up to the limit; returns its size.
-    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError> {
-        let rows = self.from.len() as u32;
-        for row in 0..rows {
-            let col = self.col_of_row[row as usize];
-            if col != NONE && self.cost(row, col) > limit {
-                (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (NONE, NONE);
-            }
-        }
-        let mut path: Vec<(u32, u32)> = Vec::new();
-        loop {
-            if !should_continue() {
-                return Err(AssignError::Interrupted);
-            }
-            self.left.restore();
-            self.free.restore();
-            for col in 0..self.row_of_col.len() as u32 {
-                if self.row_of_col[col as usize] != NONE {
-                    self.free.close(col);
-                }
-            }
-            self.reached.clear();
-            let (mut free, mut grown) = (0, 0);
-            for row in 0..rows {
-                if self.col_of_row[row as usize] != NONE {
-                    continue;
-                }
-                free += 1;
-                path.clear();
-                path.push((row, NONE));
-                while let Some(&(row, _)) = path.last() {
-                    let Some(col) = self.reach(row, limit) else {
-                        self.reached.push(row);
-                        path.pop();
-                        continue;
-                    };
-                    let owner = self.row_of_col[col as usize];
-                    if let Some(last) = path.last_mut() {
-                        last.1 = col;
-                    }
-                    if owner == NONE {
-                        for &(row, col) in &path {
-                            (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (col, row);
-                        }
-                        grown += 1;
-                        break;
-                    }
-                    path.push((owner, NONE));
-                }
-            }
-            if grown == 0 || grown == free {
-                return Ok(rows as usize - free + grown);
-            }
-        }
+    /// The cheapest pair that leads out of what the last round has reached.
+    fn next(&mut self) -> f64 {
+        let reached = std::mem::take(self.reached());
+        let next = reached.iter().filter_map(|&row| self.seeker().cheapest(row)).min_by(f64::total_cmp);
+        *self.reached() = reached;
+        next.unwrap_or(f64::INFINITY)
+    }
+}
+
+/// Finds columns for rows.
+pub(super) struct Seeker<const D: usize> {
+    pub(super) from: Vec<[f64; D]>,
+    /// Columns that a round has not met yet, and those of them that have room.
+    pub(super) left: Tree<D>,
+    pub(super) free: Tree<D>,
+    metric: Metric,
+    own: OwnCosts,
+    /// How often a row looked for a column.
+    pub(super) looks: usize,
+}
+
+impl<const D: usize> Seeker<D> {
+    /// And the order of the rows and of the columns.
+    pub(super) fn new(from: &[[f64; D]], to: &[[f64; D]], metric: Metric, own: &OwnCosts) -> (Self, Order) {
+        let (tree, col_at) = Tree::new(to);
+        let (_, row_at) = Tree::new(from);
+        let mut place_of_col = vec![0; to.len()];
+        (0u32..).zip(&col_at).for_each(|(place, &col)| place_of_col[col as usize] = place);
+        let seeker = Self {
+            from: row_at.iter().map(|&row| from[row as usize]).collect(),
+            free: tree.clone(),
+            left: tree,
+            metric,
+            own: own.places(&row_at, &place_of_col),
+            looks: 0,
+        };
+        (seeker, Order { row_at, col_at })
     }
 
-    /// Takes a column that is left and not dearer than the limit: one without a row first, then the cheapest, which leaves the
+    /// Takes a column that is left and not dearer than the limit: one that has room first, then the cheapest, which leaves the
     /// matching mostly as it is when the limit falls.
-    fn reach(&mut self, row: u32, limit: f64) -> Option<u32> {
+    pub(super) fn reach(&mut self, row: u32, limit: f64) -> Option<u32> {
         self.looks += 1;
         let Self { own, left, free, from, metric, .. } = self;
         let (from, skip) = (&from[row as usize], |col: u32| own.get(row as usize, col as usize).is_some());
@@ -229,23 +198,109 @@ impl<const D: usize> Matching<D> {
         listed.map(|pair| pair.terms[0]).chain(found).min_by(f64::total_cmp)
     }
 
-    /// The cheapest pair that leads out of what the last round has reached.
-    fn next(&mut self) -> f64 {
-        let reached = std::mem::take(&mut self.reached);
-        let next = reached.iter().filter_map(|&row| self.cheapest(row)).min_by(f64::total_cmp);
-        self.reached = reached;
-        next.unwrap_or(f64::INFINITY)
-    }
-
-    fn cost(&self, row: u32, col: u32) -> f64 {
+    pub(super) fn cost(&self, row: u32, col: u32) -> f64 {
         match self.own.get(row as usize, col as usize) {
             Some(pair) => pair.terms[0],
             None => self.metric.cost(&self.from[row as usize], &self.left.points()[col as usize]),
         }
     }
+}
 
-    fn largest(&self) -> f64 {
+/// A matching of points.
+pub(super) struct Matching<const D: usize> {
+    pub(super) seeker: Seeker<D>,
+    col_of_row: Vec<u32>,
+    row_of_col: Vec<u32>,
+    reached: Vec<u32>,
+}
+
+impl<const D: usize> Matching<D> {
+    /// Without pairs; no more points `from` than points `to`.
+    pub(super) fn new(from: &[[f64; D]], to: &[[f64; D]], metric: Metric, own: &OwnCosts) -> Self {
+        Self {
+            seeker: Seeker::new(from, to, metric, own).0,
+            col_of_row: vec![NONE; from.len()],
+            row_of_col: vec![NONE; to.len()],
+            reached: Vec::new(),
+        }
+    }
+}
+
+impl<const D: usize> Growing<D> for Matching<D> {
+    fn seeker(&mut self) -> &mut Seeker<D> {
+        &mut self.seeker
+    }
+
+    fn whole(&self) -> usize {
+        self.col_of_row.len()
+    }
+
+    fn rows_are_shorter(&self) -> bool {
+        true
+    }
+
+    fn reached(&mut self) -> &mut Vec<u32> {
+        &mut self.reached
+    }
+
+    /// Makes the matching a largest one of pairs up to the limit; returns its size.
+    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError> {
+        let rows = self.col_of_row.len() as u32;
+        for row in 0..rows {
+            let col = self.col_of_row[row as usize];
+            if col != NONE && self.seeker.cost(row, col) > limit {
+                (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (NONE, NONE);
+            }
+        }
+        let mut path: Vec<(u32, u32)> = Vec::new();
+        loop {
+            if !should_continue() {
+                return Err(AssignError::Interrupted);
+            }
+            self.seeker.left.restore();
+            self.seeker.free.restore();
+            for col in 0..self.row_of_col.len() as u32 {
+                if self.row_of_col[col as usize] != NONE {
+                    self.seeker.free.close(col);
+                }
+            }
+            self.reached.clear();
+            let (mut free, mut grown) = (0, 0);
+            for row in 0..rows {
+                if self.col_of_row[row as usize] != NONE {
+                    continue;
+                }
+                free += 1;
+                path.clear();
+                path.push((row, NONE));
+                while let Some(&(row, _)) = path.last() {
+                    let Some(col) = self.seeker.reach(row, limit) else {
+                        self.reached.push(row);
+                        path.pop();
+                        continue;
+                    };
+                    let owner = self.row_of_col[col as usize];
+                    if let Some(last) = path.last_mut() {
+                        last.1 = col;
+                    }
+                    if owner == NONE {
+                        for &(row, col) in &path {
+                            (self.col_of_row[row as usize], self.row_of_col[col as usize]) = (col, row);
+                        }
+                        grown += 1;
+                        break;
+                    }
+                    path.push((owner, NONE));
+                }
+            }
+            if grown == 0 || grown == free {
+                return Ok(rows as usize - free + grown);
+            }
+        }
+    }
+
+    fn largest(&mut self) -> f64 {
         let pairs = (0u32..).zip(&self.col_of_row).filter(|(_, col)| **col != NONE);
-        pairs.map(|(row, &col)| self.cost(row, col)).fold(f64::NEG_INFINITY, f64::max)
+        pairs.map(|(row, &col)| self.seeker.cost(row, col)).fold(f64::NEG_INFINITY, f64::max)
     }
 }

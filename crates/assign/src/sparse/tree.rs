@@ -216,27 +216,26 @@ impl<const D: usize> Tree<D> {
         &mut self,
         from: &[f64; D],
         metric: &Metric,
-        mut limit: f64,
+        limit: f64,
         skip: impl Fn(u32) -> bool,
     ) -> Option<(u32, f64)> {
-        let mut found = None;
+        // What costs the limit itself counts, until something does: of many in one place the first is enough.
+        let (mut found, mut below) = (None, limit.next_up());
         let mut stack = std::mem::take(&mut self.stack);
         stack.clear();
         stack.push((0, f64::NEG_INFINITY));
         while let Some((place, bound)) = stack.pop() {
-            if bound > limit {
+            if bound >= below {
                 continue;
             }
             if place & IS_LEAF == 0 {
-                // What costs the limit itself counts.
-                self.open(place, from, metric, limit.next_up(), true, &mut stack);
+                self.open(place, from, metric, below, true, &mut stack);
                 continue;
             }
             let leaf = &self.leaves[(place & !IS_LEAF) as usize];
             for (point, cost) in (leaf.start..leaf.end).zip(leaf.costs(from, metric)) {
-                let better = cost < limit || (found.is_none() && cost == limit && cost < f64::INFINITY);
-                if better && !self.closed[point as usize] && !skip(point) {
-                    (found, limit) = (Some((point, cost)), cost);
+                if cost < below && !self.closed[point as usize] && !skip(point) {
+                    (found, below) = (Some((point, cost)), cost);
                 }
             }
         }

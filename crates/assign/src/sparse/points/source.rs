@@ -35,6 +35,19 @@ impl<const D: usize> Points<D> {
         let from = row_at.iter().map(|&row| from[row as usize]).collect();
         (Self { from, tree, metric, own, largest_cost, sink }, Order { row_at, col_at })
     }
+
+    /// Brings the source up to date after any prices have changed, in any direction.
+    pub(in crate::sparse) fn reprice_all(&mut self, price: &[f64]) {
+        self.tree.reprice_all(price);
+    }
+
+    /// Two doubles that sum to the cost of a pair, and whether it is in force.
+    pub(in crate::sparse) fn terms(&self, row: u32, col: u32) -> ([f64; 2], bool) {
+        match self.own.get(row as usize, col as usize) {
+            Some(pair) => (pair.terms, pair.current),
+            None => ([self.metric.cost(&self.from[row as usize], &self.tree.points()[col as usize]), 0.0], false),
+        }
+    }
 }
 
 impl<const D: usize> Candidates for Points<D> {
