@@ -51,8 +51,8 @@ type Functions = (Box<dyn Policy>, Box<dyn nets::Network>);
 /// Rows of one pass of a network without memory, about: a longer pass gains nothing, and some need much room for one.
 const AT_ONCE: usize = 2048;
 
-/// Rows of a slice of a minibatch, at least: with fewer ones the operations cost more than what they compute.
-const SLICE_ROWS: usize = 1024;
+/// Rows of one step of a network with memory, about.
+const STEP_ROWS: usize = 48;
 
 /// The algorithm with its settings.
 #[derive(Debug)]
@@ -66,6 +66,7 @@ pub struct Mappo {
 }
 
 /// Values and memories under the weights that an iteration starts with.
+#[derive(Clone, Default)]
 struct Evaluation {
     /// [T+1, N] normalised values of one episode.
     values: Vec<f32>,
@@ -130,10 +131,9 @@ impl Mappo {
 
         // 1. Values and memories under the weights that collected the batch.
         let constants = self.constants(networks)?;
-        let evaluations: Vec<Evaluation> = (0..episodes)
-            .into_par_iter()
-            .map(|episode| self.evaluate(&constants, batch, episode))
-            .collect::<Result<_>>()?;
+        let all: Vec<usize> = (0..episodes).collect();
+        let groups = all.par_chunks(self.together(batch)).map(|group| self.evaluate(&constants, batch, group));
+        let evaluations: Vec<Evaluation> = groups.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect();
         for (episode, evaluation) in evaluations.iter().enumerate() {
             self.check_log_probs(episode, evaluation.error)?;
         }
@@ -180,9 +180,9 @@ impl Mappo {
                 let moments = value_norm.moments();
 
                 // 5. Gradients of both losses, slice by slice.
-                let (policy, value) = (self.policy(networks)?, self.value(networks)?);
-                let worth_it = (units.len() * self.chunk * n / SLICE_ROWS).max(1);
-                let count = m.gradient_slices.min(units.len()).min(worth_it);
+                let (policy, value) = rayon::join(|| self.policy(networks), || self.value(networks));
+                let (policy, value) = (policy?, value?);
+                let count = m.gradient_slices.min(units.len());
                 let slice = |s| Slice { batch, units: &units[part(units.len(), count, s)], chunk: self.chunk, samples };
                 let slices: Vec<Slice<'_>> = (0..count).map(slice).collect();
                 let losses = |s: &Slice<'_>| {
@@ -217,13 +217,13 @@ impl Mappo {
                 }
 
                 // 7. Clip by global norm, step. If only the gradient of one network is not finite, skip that network.
-                let mut norms = vec![0.0; parts.len()];
-                for (k, (network, part)) in networks.iter_mut().zip(parts).enumerate() {
+                let step = |(k, (network, part)): (usize, (&mut Network, &Part))| {
                     let gradients = policy.iter().map(|(g, _)| &g[k]).chain(value.iter().map(|(g, _)| &g[k]));
                     let rate = if part.policy { m.actor_learning_rate } else { m.critic_learning_rate } * decay;
                     let (values, limit) = (&mut network.params.values, m.max_grad_norm.into());
-                    norms[k] = network.moments.adam_step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit);
-                }
+                    network.moments.adam_step(values, &sum_in_order(gradients), rate, m.adam_epsilon, limit)
+                };
+                let norms: Vec<f64> = networks.par_iter_mut().zip(parts).enumerate().map(step).collect();
                 if norms.iter().any(|norm| !norm.is_finite()) {
                     total.skipped += 1.0;
                     continue;
@@ -259,33 +259,51 @@ impl Mappo {
         Ok(out)
     }
 
-    /// Values of all T+1 states of one episode, and the memories entering each chunk, by running both networks through
-    /// the episode a chunk at a time.
-    fn evaluate(&self, (policy, value): &Functions, batch: &Batch, episode: usize) -> Result<Evaluation> {
+    /// Episodes that are evaluated together: enough rows for a pass to be worth it, few enough for every thread to get some. Rows do
+    /// not depend on each other.
+    fn together(&self, batch: &Batch) -> usize {
+        let (states, n) = (batch.shape.steps + 1, batch.shape.agents);
+        let (rows, wanted) = if self.model.memory() == 0 { (states * n, AT_ONCE / 2) } else { (n, STEP_ROWS) };
+        (wanted / rows).max(1)
+    }
+
+    /// Values of all T+1 states of some episodes, and the memories entering each chunk, by running both networks through
+    /// the episodes a chunk at a time.
+    fn evaluate(&self, (policy, value): &Functions, batch: &Batch, episodes: &[usize]) -> Result<Vec<Evaluation>> {
         let (steps, n, memory) = (batch.shape.steps, batch.shape.agents, self.model.memory());
-        let values = Vec::with_capacity((steps + 1) * n);
-        let mut out = Evaluation { values, policy_memory: Vec::new(), value_memory: Vec::new(), error: 0.0 };
-        let mut value_hidden = vec![0.0; n * memory];
+        let mut out = vec![Evaluation::default(); episodes.len()];
+        let mut value_hidden = vec![0.0; episodes.len() * n * memory];
         let mut policy_hidden = value_hidden.clone();
         // Networks without memory have no chunks to respect: a chunk's length only bounds the working memory.
-        let stride = if memory == 0 { (AT_ONCE / n).max(10) } else { self.chunk };
+        let stride = if memory == 0 { (AT_ONCE / (episodes.len() * n)).max(10) } else { self.chunk };
         let mut start = 0;
         while start <= steps {
             let count = stride.min(steps + 1 - start);
-            let slice = Slice { batch, units: &[(episode, start)], chunk: count, samples: 0.0 };
+            let units: Vec<(usize, usize)> = episodes.iter().map(|&episode| (episode, start)).collect();
+            let slice = Slice { batch, units: &units, chunk: count, samples: 0.0 };
             let features = slice.features();
             let output = value.forward(&slice.input(&features, value_hidden.clone(), GraphNoise::Off))?;
-            out.values.extend(output.out.flatten_all()?.to_vec1::<f32>()?);
+            // [L, C, N]
+            let values = output.out.flatten_all()?.to_vec1::<f32>()?;
+            for (row, values) in values.chunks_exact(n).enumerate() {
+                out[row % episodes.len()].values.extend_from_slice(values);
+            }
             if memory > 0 && start < steps {
-                out.policy_memory.extend_from_slice(&policy_hidden);
-                out.value_memory.extend_from_slice(&value_hidden);
+                let entering = policy_hidden.chunks_exact(n * memory).zip(value_hidden.chunks_exact(n * memory));
+                for (out, (policy, value)) in out.iter_mut().zip(entering) {
+                    out.policy_memory.extend_from_slice(policy);
+                    out.value_memory.extend_from_slice(value);
+                }
                 value_hidden = last_state(output.states.as_ref(), value_hidden)?;
                 let input = slice.input(&features, policy_hidden.clone(), slice.noise());
                 let (choices, moves) = (slice.actions(), slice.moves());
                 let now = policy.evaluate(&input, Taken { choices: &choices, moves: &moves })?;
                 let differences = (now.log_probs - slice.column(&batch.log_probs)?)?;
                 let differences = only(slice.active()?.as_ref(), differences)?.to_vec1::<f32>()?;
-                out.error = differences.into_iter().fold(out.error, worse);
+                for (row, differences) in differences.chunks_exact(n).enumerate() {
+                    let out = &mut out[row % episodes.len()];
+                    out.error = differences.iter().copied().fold(out.error, worse);
+                }
                 policy_hidden = last_state(now.states.as_ref(), policy_hidden)?;
             }
             start += count;

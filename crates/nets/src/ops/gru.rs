@@ -96,7 +96,13 @@ impl Op {
         let Sizes { inputs, hidden } = self.sizes;
         let (all, width) = x.rows();
         let rows = self.h0.len() / hidden.max(1);
-        if hidden == 0 || hidden % LANES != 0 || width != inputs || rows == 0 || all % rows != 0 {
+        if hidden == 0
+            || hidden % LANES != 0
+            || width != inputs
+            || rows == 0
+            || rows * hidden != self.h0.len()
+            || all % rows != 0
+        {
             bail!(
                 "gru: input {:?} and {} initial states do not fit {inputs} inputs, {hidden} units",
                 x.dims,
