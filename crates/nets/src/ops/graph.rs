@@ -1,9 +1,9 @@
 mod gradients;
 
 use super::buffer::Buffer;
-use super::matmul::Rows;
+use super::matmul::{Activation, Packed, Rows, Start, layer};
 use super::operation::{Arg, Operation, apply3};
-use super::simd::{LANES, ln_of_normal, load, store, transpose};
+use super::simd::{LANES, ln_of_normal, load, store, sum, transpose};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::{Arc, OnceLock};
 use wide::f32x16;
@@ -51,6 +51,9 @@ pub fn graph_block(
     let keep = [features, relative, score].into_iter().any(Tensor::track_op);
     apply3(Op { block, noise, keep, saved: OnceLock::new() }, [features, relative, score])
 }
+
+/// Agents whose edges are in the cache at once.
+const TILE: usize = 48;
 
 struct Op {
     block: GraphBlock,
@@ -107,26 +110,6 @@ impl Op {
         transpose(Rows::new(rows, p), n, p, receiver, *padded);
     }
 
-    /// Edges of agent i.
-    #[inline(always)]
-    fn degree(&self, i: usize, logits: &[f32]) -> usize {
-        (0..logits.len()).step_by(LANES).map(|v| self.edge_mask(i, logits, v).count_ones() as usize).sum()
-    }
-
-    /// One bit for each of the neighbours from v on that an edge leads to.
-    #[inline(always)]
-    fn edge_mask(&self, i: usize, logits: &[f32], v: usize) -> u32 {
-        let n = self.block.agents;
-        let mut mask = load(&logits[v..]).simd_gt(f32x16::ZERO).to_bitmask();
-        if n - v < LANES {
-            mask &= (1 << (n - v)) - 1;
-        }
-        if (v..v + LANES).contains(&i) {
-            mask &= !(1 << (i - v));
-        }
-        mask
-    }
-
     /// Logits plus noise of agent i towards all others, sixteen neighbours at a time.
     #[inline(always)]
     fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &Scratch, logits: &mut [f32]) {
@@ -173,49 +156,21 @@ impl Op {
         }
     }
 
-    /// Calls `f` for every present edge i → j, in ascending j. Returns the degree.
+    /// Edges of agent i as ones and zeros [padded]. Returns the degree.
     #[inline(always)]
-    fn edges(&self, i: usize, logits: &[f32], mut f: impl FnMut(usize)) -> usize {
-        let mut degree = 0;
+    fn edges(&self, i: usize, logits: &[f32], edges: &mut [f32]) -> usize {
+        let n = self.block.agents;
         for v in (0..logits.len()).step_by(LANES) {
-            let mut mask = self.edge_mask(i, logits, v);
-            degree += mask.count_ones() as usize;
-            while mask != 0 {
-                f(v + mask.trailing_zeros() as usize);
-                mask &= mask - 1;
-            }
+            store(load(&logits[v..]).simd_gt(f32x16::ZERO) & f32x16::ONE, &mut edges[v..]);
         }
-        degree
-    }
-
-    /// Mean message of agent i, and its divisor max(1, degree).
-    #[inline(always)]
-    fn message(&self, i: usize, features: &[f32], logits: &[f32], message: &mut [f32]) {
-        let (columns, width) = (self.columns(), self.block.width);
-        let z0 = 2 * self.block.pair_hidden;
-        message.fill(0.0);
-        let degree = if width == 2 * LANES {
-            // The usual width, held in registers: the same sums in the same order as below.
-            let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
-            let degree = self.edges(i, logits, |j| {
-                let z = &features[j * columns + z0..];
-                a += load(z);
-                b += load(&z[LANES..]);
-            });
-            store(a, message);
-            store(b, &mut message[LANES..]);
-            degree
-        } else {
-            self.edges(i, logits, |j| {
-                for (m, z) in message.iter_mut().zip(&features[j * columns + z0..]) {
-                    *m += z;
-                }
-            })
-        };
-        let inverse = 1.0 / degree.max(1) as f32;
-        for m in message.iter_mut() {
-            *m *= inverse;
+        // Neither an agent itself nor what fills up the last vector is a neighbour.
+        edges[i] = 0.0;
+        edges[n..].fill(0.0);
+        let mut degree = f32x16::ZERO;
+        for v in (0..edges.len()).step_by(LANES) {
+            degree += load(&edges[v..]);
         }
+        sum(degree) as usize
     }
 
     fn aggregate(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
@@ -225,21 +180,34 @@ impl Op {
         let mut scratch = self.scratch();
         let padded = scratch.padded;
         let kept = if self.keep { states * n } else { 1 };
-        let (mut logits, mut messages) = (Buffer::take(kept * padded), Buffer::take(kept * width));
+        let (mut logits, mut messages) =
+            (Buffer::take(kept * padded), Buffer::take(if self.keep { kept } else { TILE } * width));
+        let (mut edges, mut degrees) = (Buffer::take(TILE * padded), [0; TILE]);
         for s in 0..states {
             let features = &features[s * n * columns..(s + 1) * n * columns];
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
-            for i in 0..n {
-                let row = if self.keep { s * n + i } else { 0 };
-                let logits = &mut logits[row * padded..(row + 1) * padded];
-                let message = &mut messages[row * width..(row + 1) * width];
-                self.row_logits(s, i, score, &scratch, logits);
-                self.message(i, features, logits, message);
-                let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
-                let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
-                for k in 0..width {
-                    let own = if self.block.self_path { own[k] } else { 0.0 };
-                    out[k] = (own + message[k]).max(0.0);
+            // The sum over the neighbours is a product of ones and zeros with z: the same sums in the same order as one by one.
+            let z = Packed::of_rows(Rows::new(features, columns).skip(2 * p), n, width);
+            for first in (0..n).step_by(TILE) {
+                let rows = TILE.min(n - first);
+                for (row, i) in (first..first + rows).enumerate() {
+                    let at = if self.keep { s * n + i } else { 0 };
+                    let logits = &mut logits[at * padded..(at + 1) * padded];
+                    self.row_logits(s, i, score, &scratch, logits);
+                    degrees[row] = self.edges(i, logits, &mut edges[row * padded..(row + 1) * padded]);
+                }
+                let at = if self.keep { s * n + first } else { 0 };
+                let messages = &mut messages[at * width..(at + rows) * width];
+                layer(Rows::new(&edges, padded), &z, Start::Zero, Activation::Identity, messages, width, rows);
+                for ((i, message), degree) in (first..).zip(messages.chunks_exact_mut(width)).zip(degrees) {
+                    let inverse = 1.0 / degree.max(1) as f32;
+                    let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
+                    let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
+                    for k in 0..width {
+                        message[k] *= inverse;
+                        let own = if self.block.self_path { own[k] } else { 0.0 };
+                        out[k] = (own + message[k]).max(0.0);
+                    }
                 }
             }
         }

@@ -77,15 +77,24 @@ impl Packed {
         Self::of(w, rows, columns, PANEL)
     }
 
+    /// From `count` rows of `columns` numbers that are apart.
+    pub(crate) fn of_rows(rows: Rows<'_>, count: usize, columns: usize) -> Self {
+        Self::cut(rows, count, columns, PANEL)
+    }
+
     /// With panels of up to `most` vectors: one, two or four.
     fn of(w: &[f32], rows: usize, columns: usize, most: usize) -> Self {
+        Self::cut(Rows::new(w, columns), rows, columns, most)
+    }
+
+    fn cut(w: Rows<'_>, rows: usize, columns: usize, most: usize) -> Self {
         let mut panels = Vec::new();
         let mut start = 0;
         while start < columns {
             let left = (columns - start).div_ceil(LANES);
             let q = if left >= 4 { 4 } else { left.min(2) }.min(most);
             let mut panel = Vec::with_capacity(rows * q);
-            for row in w.chunks_exact(columns) {
+            for row in w.values.chunks(w.stride).take(rows) {
                 for v in 0..q {
                     let at = (start + v * LANES).min(columns);
                     panel.push(load(&row[at..columns]));

@@ -1,6 +1,7 @@
 //! The way back through a graph block.
 
-use super::{Op, Saved};
+use super::{Op, Saved, TILE};
+use crate::ops::gradient::Gradient;
 use crate::ops::matmul::Rows;
 use crate::ops::simd::{self, LANES, load, sigmoid, store, sum, transpose};
 use wide::f32x16;
@@ -18,10 +19,12 @@ impl Op {
         let states = features.len() / (n * columns);
         let mut scratch = self.scratch();
         let padded = scratch.padded;
-        // Zeros: the gradients of z are sums over edges.
         let (mut all_d_features, mut d_relative) = (vec![0.0; features.len()], vec![0.0; relative.len()]);
         let (mut z, mut d_logits) = (vec![0.0; width * padded], vec![0.0; padded]);
-        let mut g = vec![0.0; width];
+        // Rows of a tile: gradients of their messages in whole vectors, and their edges.
+        let stride = width.next_multiple_of(LANES);
+        let (mut all_g, mut edges, mut d_z) =
+            (vec![0.0; TILE * stride], vec![0.0; TILE * padded], vec![0.0; n * width]);
         let mut sums = PairSums::new(p, padded);
         let (mut d_score, mut all) = (vec![0.0f32; p + 1], vec![0.0; p]);
         let (mut scaled, mut d_receiver) = (vec![0.0; p * padded], vec![0.0; padded * p]);
@@ -32,17 +35,18 @@ impl Op {
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
             transpose(Rows::new(features, columns).skip(2 * p), n, width, &mut z, padded);
             sums.receiver.fill(f32x16::ZERO);
+            let mut through_edges = Gradient::new(n, width);
             for i in 0..n {
                 let row = s * n + i;
                 let logits = &saved.logits[row * padded..(row + 1) * padded];
                 let message = &saved.messages[row * width..(row + 1) * width];
-                let degree = self.degree(i, logits);
+                let degree = self.edges(i, logits, &mut edges[i % TILE * padded..][..padded]);
                 let at = row * width..(row + 1) * width;
                 let own =
                     &mut d_features[i * columns + 2 * p + width..][..if self.block.self_path { width } else { 0 }];
-                let through_mean = message_gradient((&y[at.clone()], &dy[at], message), degree, &mut g, own);
-                self.edges(i, logits, |j| add(&g, &mut d_features[j * columns + 2 * p..][..width]));
-                self.edge_gradients(logits, &z, &g, through_mean, &mut d_logits);
+                let g = &mut all_g[i % TILE * stride..][..width];
+                let through_mean = message_gradient((&y[at.clone()], &dy[at], message), degree, g, own);
+                self.edge_gradients(logits, &z, g, through_mean, &mut d_logits);
                 // Neither an agent itself nor what fills up the last vector is a neighbour.
                 d_logits[i] = 0.0;
                 d_logits[n..].fill(0.0);
@@ -55,6 +59,10 @@ impl Op {
                     d_u[k] = score[k] * all[k];
                     d_q[k] = -d_u[k];
                 }
+                if (i + 1) % TILE == 0 || i + 1 == n {
+                    // z_j has a part in the messages of all agents with an edge to it.
+                    through_edges.add(Rows::new(&edges, padded), Rows::new(&all_g, stride), i % TILE + 1);
+                }
             }
             for (k, (d, receiver)) in
                 sums.receiver.chunks_exact(padded / LANES).zip(scratch.receiver.chunks_exact(padded)).enumerate()
@@ -66,6 +74,10 @@ impl Op {
                 }
             }
             transpose(Rows::new(&scaled, padded), p, padded, &mut d_receiver, p);
+            through_edges.write(&mut d_z, None);
+            for (j, d) in d_z.chunks_exact(width).enumerate() {
+                d_features[j * columns + 2 * p..][..width].copy_from_slice(d);
+            }
             for (j, d) in d_receiver.chunks_exact(p).take(n).enumerate() {
                 d_features[j * columns + p..][..p].copy_from_slice(d);
                 add(d, &mut d_relative[j * p..][..p]);
