@@ -282,7 +282,11 @@ fn a_checkpoint_of_another_format_is_refused_with_the_remedy() {
     let newest = checkpoint::list(folder.path()).pop().unwrap();
     for file in ["manifest.json", "state.json"] {
         let text = std::fs::read_to_string(newest.join(file)).unwrap();
-        std::fs::write(newest.join(file), text.replace("\"format\": 3", "\"format\": 0")).unwrap();
+        std::fs::write(
+            newest.join(file),
+            text.replace(&format!("\"format\": {}", checkpoint::FORMAT), "\"format\": 0"),
+        )
+        .unwrap();
     }
     let error = Trainer::resume(&config, folder.path(), 1).unwrap_err().to_string();
     assert!(

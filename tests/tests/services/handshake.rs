@@ -2,9 +2,9 @@
 
 use crate::sandbox::*;
 use magex_actor::run::{ActorConfig, ActorError};
-use magex_proto::v1;
 use magex_proto::v1::rollout_request::Message as Request;
 use magex_proto::v1::rollout_response::Message as Response;
+use magex_proto::{PROTOCOL_VERSION, v1};
 use tonic::Code;
 use tonic_types::StatusExt as _;
 
@@ -26,10 +26,12 @@ async fn a_wrong_task_is_refused_with_both_sides_named() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_wrong_protocol_is_refused_with_both_sides_named() {
     let learner = Learner::start().await;
-    let hello = v1::Hello { protocol_version: 4, ..Puppet::hello() };
+    let theirs = PROTOCOL_VERSION + 1;
+    let hello = v1::Hello { protocol_version: theirs, ..Puppet::hello() };
     let status = Puppet::connect(&learner.url, hello).await.unwrap().next().await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition);
-    assert!(status.message().contains("actor speaks protocol 4, learner speaks protocol 3"), "{}", status.message());
+    let named = format!("actor speaks protocol {theirs}, learner speaks protocol {PROTOCOL_VERSION}");
+    assert!(status.message().contains(&named), "{}", status.message());
     learner.stop().await;
 }
 
