@@ -11,6 +11,7 @@
 mod auction;
 mod candidates;
 mod costs;
+mod growing;
 mod line;
 mod pairs;
 mod places;

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 /// What a file of the product may have at most, in lines; 300 are wanted.
 const FILE_LINES: usize = 500;
 /// What the whole product may have at most, in lines of Rust with comments and blank lines.
-const PRODUCT_LINES: usize = 60_500;
+const PRODUCT_LINES: usize = 61_500;
 /// Cycles that stay: crate, a module of the cycle, reason. At most one in the workspace.
 const ALLOWED_CYCLES: [(&str, &str, &str); 0] = [];
 

@@ -1,8 +1,9 @@
 use super::candidates::Engine;
 use super::costs::{Metric, OwnCosts};
+use super::growing::Growing;
 use super::pairs::{AllowedPairs, solve_pairs};
 use super::points::{Limit, PointProblem, Points, check, matrix, solve_sparse};
-use super::threshold::{Growing, Matching, bottleneck_sparse};
+use super::threshold::{Matching, bottleneck_sparse};
 use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
 use magex_core::rng::{Key, Purpose, Stream};
 

@@ -8,6 +8,7 @@
 //! one vector where there are sixteen of eight. Rows are written out by a macro, because the compiler keeps an array of accumulators
 //! in memory when it unrolls a loop over more than sixteen of them too late.
 
+pub(crate) use super::simd::Rows;
 use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
@@ -40,24 +41,6 @@ impl Activation {
             Self::Relu => y.simd_gt(f32x16::ZERO) & dy,
             Self::Tanh => dy * (f32x16::ONE - y * y),
         }
-    }
-}
-
-/// Rows of numbers, `stride` apart.
-#[derive(Clone, Copy)]
-pub(crate) struct Rows<'a> {
-    pub(crate) values: &'a [f32],
-    pub(crate) stride: usize,
-}
-
-impl<'a> Rows<'a> {
-    pub(crate) fn new(values: &'a [f32], stride: usize) -> Self {
-        Self { values, stride }
-    }
-
-    /// Without the first `column` numbers.
-    pub(crate) fn skip(self, column: usize) -> Self {
-        Self { values: &self.values[column..], ..self }
     }
 }
 

@@ -1,7 +1,6 @@
 //! Loads and stores for the vector type. One vector is always sixteen lanes, whatever the machine's registers are, so
 //! that a result does not depend on the instruction set (fused multiply-add is required: x86-64-v3 or AArch64).
 
-use super::matmul::Rows;
 use wide::{f32x8, f32x16, i32x16};
 
 pub(crate) const LANES: usize = 16;
@@ -9,6 +8,24 @@ pub(crate) const LANES: usize = 16;
 /// Whether there are thirty-two registers of sixteen lanes, or sixteen of eight (where one vector takes two of them). Kernels hold
 /// as many sums at once as there is room for; each sum has its own fixed order either way.
 pub(crate) const WIDE: bool = cfg!(target_feature = "avx512f");
+
+/// Rows of numbers, `stride` apart.
+#[derive(Clone, Copy)]
+pub(crate) struct Rows<'a> {
+    pub(crate) values: &'a [f32],
+    pub(crate) stride: usize,
+}
+
+impl<'a> Rows<'a> {
+    pub(crate) fn new(values: &'a [f32], stride: usize) -> Self {
+        Self { values, stride }
+    }
+
+    /// Without the first `column` numbers.
+    pub(crate) fn skip(self, column: usize) -> Self {
+        Self { values: &self.values[column..], ..self }
+    }
+}
 
 /// The first sixteen numbers; a shorter slice is filled up with zeros.
 #[inline(always)]

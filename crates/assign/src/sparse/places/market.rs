@@ -10,8 +10,9 @@ use crate::ties;
 
 /// Pairs of places up to which all of them are arcs from the beginning.
 const FEW: usize = 1 << 18;
-/// Otherwise so many for each row, the cheapest ones; every look at all pairs adds so many that are cheaper than their values.
+/// Otherwise the cheapest ones of each row.
 const NEAREST: usize = 8;
+/// Every look at all pairs adds at most this number of them for each row, those that are cheaper than their values.
 const CHEAPER: usize = 4;
 
 /// No fewer rows than columns.

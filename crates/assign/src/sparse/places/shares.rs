@@ -4,7 +4,7 @@ use super::{Counted, Places};
 use crate::AssignError;
 use crate::sparse::NONE;
 use crate::sparse::costs::Metric;
-use crate::sparse::threshold::{Growing, Seeker};
+use crate::sparse::growing::{Growing, Seeker};
 
 /// The side of more places are the rows: ways are found sooner from many places to few.
 pub(in crate::sparse) struct Shares<const D: usize> {

@@ -1,8 +1,9 @@
 use super::Shares;
 use super::{Counted, Market, OwnCosts, Points, Problem, solve};
 use crate::sparse::costs::Metric;
+use crate::sparse::growing::Growing;
 use crate::sparse::points::{Limit, PointProblem, check, matrix, solve_sparse};
-use crate::sparse::threshold::{Growing, bottleneck_sparse};
+use crate::sparse::threshold::bottleneck_sparse;
 use crate::{BottleneckSolver, Solver, Switching, UNASSIGNED};
 use magex_core::rng::{Key, Purpose, Stream};
 
