@@ -11,7 +11,7 @@ use magex_nets::ops::{self, GraphNoise};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// E episodes of T steps of N agents. Rows of `features` are ordered [E, T+1, N], everything else [E, T, N].
+/// E episodes of T steps of N agents. Rows of `features` and `marks` are ordered [E, T+1, N], everything else [E, T, N].
 #[derive(Debug)]
 pub struct Batch {
     /// Sizes; `episodes` is E.

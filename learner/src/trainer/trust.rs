@@ -36,7 +36,7 @@ impl Trainer {
         self.judged(collector, results)
     }
 
-    /// Has evaluation shards that would end the run computed a second time, and waits for every other check.
+    /// Has the shards that a step towards the target rests on computed a second time, and waits for every other check.
     pub(super) fn confirm(&mut self, collector: &mut dyn Collector, shards: &[Shard]) -> Result<Collected, TrainError> {
         let confirmed = collector.confirm(shards).map(|()| Vec::new());
         self.judged(collector, confirmed)
