@@ -41,6 +41,7 @@ pub mod greedy;
 mod points;
 pub mod random;
 mod sparse;
+mod strongly_connected;
 mod switching;
 mod ties;
 

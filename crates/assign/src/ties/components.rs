@@ -1,6 +1,7 @@
 //! Cycles of the graph in which a row points at the owners of its nearly tight columns.
 
 use super::{Graph, Memory, NONE, Solution};
+use crate::strongly_connected::strongly_connected;
 
 /// Whether the solution is the only optimum. The pool, which owns the columns without a row, points at the rows whose columns
 /// may stay alone.
@@ -71,59 +72,19 @@ pub(super) struct Components {
 }
 
 impl Components {
-    /// Tarjan 1972, with a stack of its own; `pooled` are the rows whose columns may stay alone.
+    /// `pooled` are the rows whose columns may stay alone.
     pub(super) fn of(near: &Graph, row_of_col: &[u32], pooled: &[u32]) -> Self {
         let rows = near.rows();
         let pool = rows as u32;
         let owner: Vec<u32> = row_of_col.iter().map(|&row| if row == NONE { pool } else { row }).collect();
-        let mut of_node = vec![NONE; rows + 1];
-        // Order in which nodes were met, and the first one met of those that can be reached back.
-        let (mut met, mut low) = (vec![NONE; rows + 1], vec![0u32; rows + 1]);
-        let mut size = Vec::new();
-        let (mut open, mut path, mut count) = (Vec::new(), Vec::new(), 0);
-        for root in 0..=pool {
-            if met[root as usize] != NONE {
-                continue;
-            }
-            path.push((root, 0));
-            while let Some(&mut (node, ref mut next)) = path.last_mut() {
-                let at = node as usize;
-                if *next == 0 {
-                    (met[at], low[at]) = (count, count);
-                    count += 1;
-                    open.push(node);
-                }
-                let target = if node == pool {
-                    pooled.get(*next).copied()
-                } else {
-                    near.of(at).get(*next).map(|&col| owner[col as usize])
-                };
-                if let Some(target) = target {
-                    *next += 1;
-                    if met[target as usize] == NONE {
-                        path.push((target, 0));
-                    } else if of_node[target as usize] == NONE {
-                        low[at] = low[at].min(met[target as usize]);
-                    }
-                    continue;
-                }
-                path.pop();
-                if let Some(&(parent, _)) = path.last() {
-                    low[parent as usize] = low[parent as usize].min(low[at]);
-                }
-                if low[at] == met[at] {
-                    let component = size.len() as u32;
-                    size.push(0);
-                    while let Some(member) = open.pop() {
-                        of_node[member as usize] = component;
-                        size[component as usize] += 1;
-                        if member == node {
-                            break;
-                        }
-                    }
-                }
-            }
-        }
+        let (of_node, size) = strongly_connected(rows + 1, |node, at| {
+            let target = if node == pool {
+                pooled.get(at).copied()
+            } else {
+                near.of(node as usize).get(at).map(|&col| owner[col as usize])
+            };
+            target.map(Some)
+        });
         Self { of_node, owner, size }
     }
 

@@ -5,6 +5,7 @@
 //! a place are alike until they choose, and choices leave less and less, so what one of them cannot have, the later ones cannot
 //! have either.
 
+use crate::strongly_connected::strongly_connected;
 use crate::ties::NONE;
 use crate::{AssignError, UNASSIGNED};
 use std::cmp::Reverse;
@@ -237,54 +238,18 @@ impl<'a> Choice<'a> {
         self.looked = 0;
     }
 
-    /// The strongly connected component of every place of agents and, behind them, of goals (Tarjan 1972, with a stack of its own).
-    /// Agents lead to goals over every arc, goals back over those with flow.
+    /// The strongly connected component of every place of agents and, behind them, of goals. Agents lead to goals over every arc,
+    /// goals back over those with flow.
     fn components(&self) -> Vec<u32> {
         let agents = self.met_agents.len() as u32;
-        let nodes = self.met_agents.len() + self.met_goals.len();
-        let (mut of, mut met, mut low) = (vec![NONE; nodes], vec![NONE; nodes], vec![0u32; nodes]);
-        let (mut open, mut path, mut count) = (Vec::new(), Vec::new(), 0);
-        for root in 0..nodes as u32 {
-            if met[root as usize] != NONE {
-                continue;
-            }
-            path.push((root, 0));
-            while let Some(&mut (node, ref mut next)) = path.last_mut() {
-                let at = node as usize;
-                if *next == 0 {
-                    (met[at], low[at]) = (count, count);
-                    count += 1;
-                    open.push(node);
-                }
-                let out = if node < agents { self.from.of(node) } else { self.to.of(node - agents) };
-                if let Some(&arc) = out.get(*next) {
-                    *next += 1;
-                    let tight = &self.arcs[arc as usize];
-                    if !self.alive[arc as usize] || (node >= agents && tight.flow == 0) {
-                        continue;
-                    }
-                    let target = (if node < agents { agents + tight.goals } else { tight.agents }) as usize;
-                    if met[target] == NONE {
-                        path.push((target as u32, 0));
-                    } else if of[target] == NONE {
-                        low[at] = low[at].min(met[target]);
-                    }
-                    continue;
-                }
-                path.pop();
-                if let Some(&(parent, _)) = path.last() {
-                    low[parent as usize] = low[parent as usize].min(low[at]);
-                }
-                if low[at] == met[at] {
-                    while let Some(member) = open.pop() {
-                        of[member as usize] = node;
-                        if member == node {
-                            break;
-                        }
-                    }
-                }
-            }
-        }
-        of
+        let out = |node: u32, at: usize| {
+            let forward = node < agents;
+            let arcs = if forward { self.from.of(node) } else { self.to.of(node - agents) };
+            let &arc = arcs.get(at)?;
+            let tight = &self.arcs[arc as usize];
+            let counts = self.alive[arc as usize] && (forward || tight.flow > 0);
+            Some(counts.then_some(if forward { agents + tight.goals } else { tight.agents }))
+        };
+        strongly_connected(self.met_agents.len() + self.met_goals.len(), out).0
     }
 }
