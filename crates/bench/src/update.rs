@@ -29,9 +29,50 @@ pub(crate) struct UpdateArgs {
     /// Updates that the median is taken of.
     #[arg(long, value_name = "K", default_value_t = 9, value_parser = settings::count)]
     rounds: u32,
+    /// Time an agent sample takes as teams grow, in place of the executors.
+    #[arg(long)]
+    growth: bool,
+}
+
+/// A minibatch of about [`MINIBATCH`] agent samples of teams anywhere on the map.
+fn config(kind: ExecutorKind, recurrent: bool, agents: usize) -> RunConfig {
+    let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
+    config.executor.kind = kind;
+    config.executor.recurrent = recurrent;
+    config.mappo.minibatch_size = MINIBATCH;
+    config
 }
 
 pub(crate) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
+    if args.growth { growth(args.rounds) } else { executors(args) }
+}
+
+/// The time of an agent sample by team size. A map grows with its team, so that neighbours are as dense.
+fn growth(rounds: u32) -> anyhow::Result<Report> {
+    let title = "One PPO minibatch, one core: microseconds of an agent sample as teams grow";
+    let heading = ["executor", "N", "samples", "µs", "µs with values and advantages", "least µs", "against N = 5"];
+    let mut report = Report::new("update", title, 1, &heading);
+    let teams = [
+        (ExecutorKind::Local, &[5, 20, 50, 200, 1_000][..]),
+        (ExecutorKind::Flat, &[5, 20, 50]),
+        (ExecutorKind::Magex, &[5, 20, 50, 200]),
+    ];
+    for (kind, sizes) in teams {
+        let mut first = None;
+        for &agents in sizes {
+            let time = minibatch(&config(kind, false, agents), 8, rounds as usize)?;
+            let each = |ms: f64| 1e3 * ms / time.samples as f64;
+            let ratio = each(time.least_ms) / *first.get_or_insert(each(time.least_ms));
+            let mut cells = vec![kind.to_string(), agents.to_string(), time.samples.to_string()];
+            cells.extend([time.gradient_ms, time.update_ms, time.least_ms].map(|ms| format!("{:.2}", each(ms))));
+            cells.push(format!("{ratio:.2} x"));
+            report.row(cells, json!({ "executor": kind, "agents": agents, "time": time, "against_5": ratio }));
+        }
+    }
+    Ok(report)
+}
+
+fn executors(args: &UpdateArgs) -> anyhow::Result<Report> {
     let title = "One PPO minibatch, one core: actor and critic, forward, loss, backward, Adam";
     let heading = ["executor", "N", "samples", "ms", "ms with values and advantages", "least ms", "GFLOP/s", "of peak"];
     let mut report = Report::new("update", title, 1, &heading);
@@ -45,10 +86,7 @@ pub(crate) fn update(args: &UpdateArgs) -> anyhow::Result<Report> {
         (ExecutorKind::Flat, false, 20),
         (ExecutorKind::Flat, true, 20),
     ] {
-        let mut config = RunConfig { task: TaskConfig::simple_spread(agents, Spawn::Uniform), ..RunConfig::default() };
-        config.executor.kind = kind;
-        config.executor.recurrent = recurrent;
-        config.mappo.minibatch_size = MINIBATCH;
+        let config = config(kind, recurrent, agents);
         let rounds = if kind == ExecutorKind::Local { args.rounds } else { args.rounds.div_ceil(3) };
         let time = minibatch(&config, 8, rounds as usize)?;
         peak = peak.max(self::peak());

@@ -271,6 +271,8 @@ fn tables_are_reproduced_interrupted_and_made_again_without_training() {
         &["whole/runs/push-ball/mage-x-5/seed-1", "run.max_steps is 24000, not 9600"],
     );
     place.says(&format!("{other} --tables-only"));
+    place.fails("reproduce --table drones --agents 50", 64, &["--systems, --agents", "leave one out"]);
+    place.fails("reproduce --agents 7", 64, &["--agents", "'7' is unknown; use 2, 4, 5, 20, 50"]);
     fs::write(place.path("cut/results/push-ball/mage-x-5-seed-1.json"), "{}").unwrap();
     place.fails(&line, 1, &["cut/results/push-ball/mage-x-5-seed-1.json", "remove it"]);
 }
@@ -278,7 +280,7 @@ fn tables_are_reproduced_interrupted_and_made_again_without_training() {
 #[test]
 fn runs_have_the_layout_of_marl_eval() {
     let place = Place::new();
-    place.says("reproduce --budget smoke --table drones,planner --systems mage-x,scripted,astar --max-steps 240 --episodes 3 --seeds 1,2 --out out");
+    place.says("reproduce --budget smoke --table drones,planner --systems mage-x,scripted,astar --agents 2,4,5 --max-steps 240 --episodes 3 --seeds 1,2 --out out");
     let runs: Value = serde_json::from_str(&place.read("out/runs.json")).unwrap();
     let object = |value: &Value| value.as_object().unwrap().clone();
     assert_eq!(object(&runs).keys().collect::<Vec<_>>(), ["drones", "planner"]);
@@ -321,6 +323,15 @@ fn wall_time_ends_a_training_and_is_told() {
     assert_eq!(cell["ended_by"], "time");
     assert!((1..1_000_000_000).contains(&(cell["joint_env_steps"].as_f64().unwrap() as u64)), "{value}");
     assert!(place.read("out/tables.md").contains("| time |"));
+    // The same command trains nothing; one with more time goes on from the folder of the run.
+    let systems = "--systems mage-x,random";
+    let steps = |line: &str| place.json(&format!("{line} {systems}"))["cells"][0]["joint_env_steps"].as_u64().unwrap();
+    let first = steps(line);
+    let before = place.read("out/runs/spread/mage-x-5/seed-1/metrics.jsonl");
+    assert_eq!(steps(line), first);
+    let more = line.replace("0.02", "0.1");
+    assert!(steps(&format!("{more} --tables-only")) == first && steps(&more) > first);
+    assert!(place.read("out/runs/spread/mage-x-5/seed-1/metrics.jsonl").starts_with(&before));
 }
 
 #[test]

@@ -25,11 +25,12 @@ Examples:
   magex reproduce                              every table, one seed, minutes
   magex reproduce --budget smoke               everything once, in small: for CI
   magex reproduce --table spread,drones --budget paper --out results/paper
-  magex reproduce --systems mage-x --seeds 1,2,3,4,5
+  magex reproduce --systems mage-x --agents 5,20 --seeds 1,2,3,4,5
   magex reproduce --tables-only --out results/paper --budget paper    nothing is trained
 
 OUT gets tables.md, tables.csv, <table>.svg and runs.json (marl-eval), from OUT/results/<table>/<system>-<N>-seed-<s>.json; \
-    the run folders are in OUT/runs. What has a result is not trained again. The first Ctrl-C stops after the iteration, and \
+    the run folders are in OUT/runs. What has a result is not trained again, unless it ended early for want of minutes and may have \
+    more now. The first Ctrl-C stops after the iteration, and \
     the same command continues.
 
 Exit codes: 0 success, 1 training or evaluation failed, 64 wrong usage, or --out has results of another configuration, \
@@ -55,6 +56,9 @@ pub(crate) struct ReproduceArgs {
     /// Only these systems, by the names of their folders, such as mage-x [default: all].
     #[arg(long, value_name = "SYSTEM,…", value_delimiter = ',', value_parser = system)]
     systems: Vec<String>,
+    /// Only these team sizes [default: all of a table].
+    #[arg(long, value_name = "N,…", value_delimiter = ',', value_parser = team)]
+    agents: Vec<usize>,
     /// Joint environment steps of every training, in place of the budget's.
     #[arg(long, value_name = "M", value_parser = parse::whole::<u64>(1, STEPS_MAX))]
     max_steps: Option<u64>,
@@ -82,6 +86,15 @@ fn system(text: &str) -> Result<String, String> {
     names.sort_unstable();
     names.dedup();
     known(text, &names)
+}
+
+fn team(text: &str) -> Result<usize, String> {
+    let mut sizes: Vec<usize> = TABLES.iter().flat_map(|table| table.tasks).map(|task| task.agents).collect();
+    sizes.sort_unstable();
+    sizes.dedup();
+    let names: Vec<String> = sizes.iter().map(usize::to_string).collect();
+    known(text, &names.iter().map(String::as_str).collect::<Vec<_>>())?;
+    text.parse().map_err(|error| format!("'{text}': {error}"))
 }
 
 fn known(text: &str, names: &[&str]) -> Result<String, String> {
@@ -116,6 +129,9 @@ pub(crate) fn run(args: &ReproduceArgs, options: &CommonOptions) -> anyhow::Resu
     let wanted = |table: &&PaperTable| args.table.iter().any(|name| name == table.name || name == "all");
     let chosen: Vec<&'static PaperTable> = TABLES.iter().filter(wanted).collect();
     let mut jobs = jobs(args, &budget, &chosen, &out)?;
+    if jobs.is_empty() {
+        return Err(usage("--systems, --agents: none of the tables has such systems with such teams; leave one out"));
+    }
     let missing = jobs.iter().filter(|job| job.record.is_none()).count();
     if missing > 0 && !args.tables_only {
         note(format!(
@@ -149,7 +165,8 @@ fn jobs(args: &ReproduceArgs, budget: &Budget, chosen: &[&'static PaperTable], o
     let mut jobs = Vec::new();
     for table in chosen {
         for mut cell in budget.cells(table)? {
-            if !args.systems.is_empty() && !args.systems.iter().any(|id| id == cell.system.id) {
+            let wanted = args.systems.is_empty() || args.systems.iter().any(|id| id == cell.system.id);
+            if !wanted || !(args.agents.is_empty() || args.agents.contains(&table.tasks[cell.task].agents)) {
                 continue;
             }
             if args.max_minutes.is_some() {
@@ -157,16 +174,18 @@ fn jobs(args: &ReproduceArgs, budget: &Budget, chosen: &[&'static PaperTable], o
             }
             for &seed in &budget.seeds {
                 let path = record::path(out, &cell, seed);
-                let record = record::read(&path)?;
+                let mut record = record::read(&path)?;
                 if !args.tables_only {
-                    match &record {
-                        Some(record) => {
-                            let differing = record.differs(&configuration(&cell, seed))?;
-                            if !differing.is_empty() {
-                                return Err(other(&path, &differing));
-                            }
+                    if let Some(record) = &record {
+                        let differing = record.differs(&configuration(&cell, seed))?;
+                        if !differing.is_empty() {
+                            return Err(other(&path, &differing));
                         }
-                        None => check_folder(out, &cell, seed)?,
+                    }
+                    // More time than it had: its run goes on, or begins again where the folder is gone.
+                    record = record.filter(|record| !record.is_cut_short(cell.wall_s));
+                    if record.is_none() {
+                        check_folder(out, &cell, seed)?;
                     }
                 }
                 jobs.push(Job { cell: cell.clone(), seed, record });

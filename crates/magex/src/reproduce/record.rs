@@ -22,6 +22,9 @@ const POINTS: usize = 200;
 const FLAT: f64 = 0.01;
 /// Evaluations below which nothing can be said of it.
 const FEW: usize = 8;
+/// A training that its wall time ended had less than it may have now if it took less than this share of it: the rest leaves
+/// room for what is not training.
+const SPENT: f64 = 0.8;
 
 /// One cell and seed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -144,6 +147,11 @@ impl Record {
             Err(_) => settings::flat_value(&self.config),
         };
         Ok(settings::changes(&own, &settings::flat(config)?))
+    }
+
+    /// Whether the training ended because of a wall time that was shorter than `limit`, in seconds.
+    pub(crate) fn is_cut_short(&self, limit: Option<f64>) -> bool {
+        self.ended_by == EndedBy::Time && limit.is_none_or(|limit| self.wall_s < SPENT * limit)
     }
 
     /// The same measurement as a cell of another table.
