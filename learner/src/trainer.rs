@@ -28,7 +28,7 @@ use crate::run_events::{RunEvent, parse_report};
 use crate::run_folder::CONFIG_FILE;
 use crate::run_start::{Changes, Parent, continued};
 use crate::train::algorithm::Algorithm;
-use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
+use crate::train::commander_ppo::{self, CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::stats::UpdateStats;
 use crate::train::suspect::UpdateError;
@@ -439,14 +439,24 @@ impl Trainer {
         let _span = tracing::info_span!(target: trace::TARGET, "update").entered();
         let iteration = self.progress.iteration;
         let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
-        let clock = Instant::now();
-        let (algorithm, learned, seed) = (&self.algorithm, &mut self.learned, self.config.run.seed);
-        let stats = self.pool.install(|| algorithm.update(learned, seed, trajectories, iteration, done.min(1.0)))?;
-        timing.executor_s = clock.elapsed().as_secs_f64();
-        let clock = Instant::now();
         let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
-        let commander = self.commander.update(&mut self.learned, trajectories, iteration, rate)?;
-        timing.commander_s = clock.elapsed().as_secs_f64();
+        let (algorithm, commander, seed) = (&self.algorithm, &self.commander, self.config.run.seed);
+        // The commander's network shares nothing with the others, and one thread is enough for it: both updates go side by side.
+        let (place, mut network) = self.learned.take(commander_ppo::NAME)?;
+        let learned = &mut self.learned;
+        let clock = Instant::now();
+        let ((stats, executor_s), decisions) = self.pool.install(|| {
+            rayon::join(
+                || {
+                    let stats = algorithm.update(learned, seed, trajectories, iteration, done.min(1.0));
+                    (stats, clock.elapsed().as_secs_f64())
+                },
+                || commander.update(&mut network, trajectories, iteration, rate),
+            )
+        });
+        self.learned.networks.insert(place, network);
+        (timing.executor_s, timing.commander_s) = (executor_s, clock.elapsed().as_secs_f64() - executor_s);
+        let (stats, commander) = (stats?, decisions?);
         Ok((stats, commander))
     }
 

@@ -16,7 +16,7 @@ pub struct Timing {
     pub collect_s: f64,
     /// Updating the executor.
     pub executor_s: f64,
-    /// Updating the commander.
+    /// What updating the commander, which goes on beside the executor's update, took beyond it.
     pub commander_s: f64,
     /// Writing checkpoints.
     pub checkpoint_s: f64,

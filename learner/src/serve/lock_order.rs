@@ -103,6 +103,7 @@ mod tests {
     }
 
     #[test]
+    #[cfg(debug_assertions)]
     #[should_panic(expected = "lock order: Work")]
     fn a_lock_of_lower_rank_is_refused() {
         let (work, status) = (OrderedMutex::new(Rank::Work, ()), OrderedMutex::new(Rank::Status, ()));

@@ -13,7 +13,7 @@ mod imitation;
 mod tests;
 
 use crate::train::batch::column;
-use crate::train::learned::{Learned, Network};
+use crate::train::learned::Network;
 use crate::train::mappo::clipped_surrogate;
 use crate::train::suspect::{LOG_PROB_TOLERANCE, Suspect, UpdateError};
 use candle_core::{Tensor, Var};
@@ -31,7 +31,8 @@ use std::slice::from_ref;
 
 pub use imitation::Lesson;
 
-const NAME: &str = "commander";
+/// The name of its network.
+pub const NAME: &str = "commander";
 
 /// One team and what was decided for it.
 #[derive(Debug, Clone)]
@@ -92,7 +93,7 @@ impl CommanderPpo {
     /// nothing if the scheduler is not learned.
     pub fn update(
         &self,
-        learned: &mut Learned,
+        network: &mut Network,
         trajectories: &[Trajectory],
         iteration: u32,
         rate_factor: f64,
@@ -100,8 +101,6 @@ impl CommanderPpo {
         if !self.config.kind.learned() {
             return Ok(CommanderStats::default());
         }
-        let missing = || ParamError::Mismatch(format!("there is no network named {NAME}"));
-        let network = learned.networks.iter_mut().find(|network| network.name == NAME).ok_or_else(missing)?;
         let commander = self.commander(network)?;
         let mut samples = Vec::new();
         let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);

@@ -56,6 +56,13 @@ impl Learned {
         self.networks.iter().find(|network| network.name == name)
     }
 
+    /// Lends the network of a name, with its place in the list, to which it must return.
+    pub(crate) fn take(&mut self, name: &str) -> Result<(usize, Network), ParamError> {
+        let place = self.networks.iter().position(|network| network.name == name);
+        let place = place.ok_or_else(|| ParamError::Mismatch(format!("there is no network named {name}")))?;
+        Ok((place, self.networks.remove(place)))
+    }
+
     /// The weights file: all networks. Its SHA-256 is the identity of what was learned.
     pub fn weights(&self) -> Result<Vec<u8>, ParamError> {
         self.file(|_| true)

@@ -1,8 +1,6 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 
 use super::*;
-use crate::train::gae::ValueNorm;
-use magex_core::about::About;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Iteration, Mode, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::{ARRIVAL_STEP, COLLISIONS_PER_AGENT_STEP};
@@ -121,12 +119,11 @@ fn trained(objective: CommanderObjective) -> f32 {
         ..RunConfig::default()
     };
     let ppo = CommanderPpo::new(&config.commander, &config.task, 1);
-    let networks = vec![ppo.init().unwrap()];
-    let mut learned = Learned { networks, value_norm: ValueNorm::new(false), replay: None, about: About::of(&config) };
+    let mut network = ppo.init().unwrap();
     let mut last = Vec::new();
     for iteration in 0..60 {
-        let played = episodes(&ppo.commander(&learned.networks[0]).unwrap(), iteration);
-        let stats = ppo.update(&mut learned, std::slice::from_ref(&played), iteration, 1.0).unwrap();
+        let played = episodes(&ppo.commander(&network).unwrap(), iteration);
+        let stats = ppo.update(&mut network, std::slice::from_ref(&played), iteration, 1.0).unwrap();
         assert_eq!((stats.skipped, stats.first_ratio_error), (0.0, 0.0));
         last = played.metrics.iter().map(|metrics| metrics[ARRIVAL_STEP]).collect();
     }
