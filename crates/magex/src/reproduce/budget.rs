@@ -14,7 +14,7 @@ const SMALL: usize = 5;
 pub(crate) enum BudgetName {
     /// A few thousand steps, small teams: checks that everything works; the numbers mean nothing.
     Smoke,
-    /// One seed, each learner's own budget, at most a minute per training.
+    /// One seed, each learner's own budget, at most 40 seconds per training.
     #[default]
     Quick,
     /// Three seeds, 3,000,000 joint steps, at most two hours per training beyond five agents.
@@ -38,7 +38,7 @@ impl BudgetName {
     pub(crate) fn budget(self) -> Budget {
         let (seeds, max_steps, wall_s, episodes) = match self {
             Self::Smoke => (vec![1], Some(3_000), None, 20),
-            Self::Quick => (vec![1], None, Some(60.0), 100),
+            Self::Quick => (vec![1], None, Some(40.0), 100),
             Self::Paper => (vec![1, 2, 3], Some(PAPER_STEPS), Some(7_200.0), 100),
         };
         Budget { name: self, seeds, max_steps, wall_s, episodes }
