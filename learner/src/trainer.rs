@@ -8,6 +8,7 @@ mod room;
 mod saving;
 mod target;
 mod trust;
+mod update;
 
 use finish::summary_of;
 pub use outcome::{TrainError, TrainOutcome};
@@ -28,10 +29,9 @@ use crate::run_events::{RunEvent, parse_report};
 use crate::run_folder::CONFIG_FILE;
 use crate::run_start::{Changes, Parent, continued};
 use crate::train::algorithm::Algorithm;
-use crate::train::commander_ppo::{self, CommanderPpo, CommanderStats};
+use crate::train::commander_ppo::{CommanderPpo, CommanderStats};
 use crate::train::learned::Learned;
 use crate::train::stats::UpdateStats;
-use crate::train::suspect::UpdateError;
 use magex_core::config::RunConfig;
 use magex_core::ids::{Mode, RunId, Shard, ShardKind, WeightsVersion};
 use magex_core::metrics_table::{REWARD, SUCCESS_RATE};
@@ -428,36 +428,6 @@ impl Trainer {
             return self.progress.on_target;
         }
         if target::reached(&self.config.run, episodes) { self.progress.on_target.saturating_add(1) } else { 0 }
-    }
-
-    fn update(
-        &mut self,
-        trajectories: &[Trajectory],
-        timing: &mut Timing,
-    ) -> Result<(UpdateStats, CommanderStats), UpdateError> {
-        self.notify(|observer| observer.phase(Phase::Training));
-        let _span = tracing::info_span!(target: trace::TARGET, "update").entered();
-        let iteration = self.progress.iteration;
-        let done = self.progress.joint_env_steps as f64 / self.config.run.max_steps.max(1) as f64;
-        let rate = if self.config.mappo.linear_decay { 1.0 - done.min(1.0) } else { 1.0 };
-        let (algorithm, commander, seed) = (&self.algorithm, &self.commander, self.config.run.seed);
-        // The commander's network shares nothing with the others, and one thread is enough for it: both updates go side by side.
-        let (place, mut network) = self.learned.take(commander_ppo::NAME)?;
-        let learned = &mut self.learned;
-        let clock = Instant::now();
-        let ((stats, executor_s), decisions) = self.pool.install(|| {
-            rayon::join(
-                || {
-                    let stats = algorithm.update(learned, seed, trajectories, iteration, done.min(1.0));
-                    (stats, clock.elapsed().as_secs_f64())
-                },
-                || commander.update(&mut network, trajectories, iteration, rate),
-            )
-        });
-        self.learned.networks.insert(place, network);
-        (timing.executor_s, timing.commander_s) = (executor_s, clock.elapsed().as_secs_f64() - executor_s);
-        let (stats, commander) = (stats?, decisions?);
-        Ok((stats, commander))
     }
 
     fn record(

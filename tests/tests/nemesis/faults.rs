@@ -118,10 +118,12 @@ pub(crate) struct Target {
 }
 
 impl Target {
-    pub(crate) fn start(config: &RunConfig) -> Self {
+    pub(crate) fn start(config: &RunConfig, minutes: u64) -> Self {
         let (wall, place) = (Wall::new(), tempfile::tempdir().unwrap());
         wall.set(0);
-        let disks = SmallDisk::mount("24m").and_then(|run| Some([run, SmallDisk::mount("24m")?]));
+        // Room for what the run writes, which is about half a mebibyte a minute: disks are full when a fault fills them.
+        let size = format!("{}m", 24 + 2 * minutes);
+        let disks = SmallDisk::mount(&size).and_then(|run| Some([run, SmallDisk::mount(&size)?]));
         let folder =
             |number: usize, name: &str| disks.as_ref().map_or(place.path(), |disks| disks[number].path()).join(name);
         let (run, data) = (folder(0, "run"), folder(1, "data"));
@@ -181,7 +183,7 @@ impl Target {
 
     pub(crate) fn check_memory(&self, most: f64) {
         for (name, memory) in &self.memory {
-            assert!(memory.slope().0 <= most, "{name} grows by {:.2} MiB/h", memory.slope().0);
+            assert!(memory.slope() <= most, "{name} grows by {:.2} MiB/h", memory.slope());
         }
     }
 
@@ -195,10 +197,7 @@ impl Target {
         let memory: Vec<String> = self
             .memory
             .iter()
-            .map(|(name, memory)| {
-                let (slope, last) = memory.slope();
-                format!("{name} {last:.1} MiB, {slope:+.2} MiB/h")
-            })
+            .map(|(name, memory)| format!("{name} {} MiB, {:+.2} MiB/h", memory.course(), memory.slope()))
             .collect();
         let Gaps { longest, explained, .. } = &self.gaps;
         format!(

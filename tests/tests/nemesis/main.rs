@@ -51,7 +51,7 @@ fn the_nemesis_finds_nothing() {
     let (minutes, seed) = (number("MAGEX_NEMESIS_MINUTES", 3), number("MAGEX_NEMESIS_SEED", 1));
     let time = Duration::from_secs(60 * minutes);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    let mut target = Target::start(&config(10_000_000));
+    let mut target = Target::start(&config(10_000_000), minutes);
     let url = format!("http://{}", target.cluster.commander_address());
     let (stop, start) = (CancellationToken::new(), Instant::now());
     let clients: Vec<_> = (0..CLIENTS)

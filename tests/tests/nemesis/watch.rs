@@ -94,8 +94,16 @@ impl Memory {
         }
     }
 
-    /// Slope of the least squares in MiB per hour, without the first third: caches fill. And the last value.
-    pub(crate) fn slope(&self) -> (f64, f64) {
+    /// Values at a few moments, the first and the last among them.
+    pub(crate) fn course(&self) -> String {
+        const MOMENTS: usize = 6;
+        let last = self.0.len().saturating_sub(1);
+        let at = |k: usize| self.0.get(k * last / MOMENTS).map_or(0.0, |at| at.1);
+        (0..=MOMENTS).map(|k| format!("{:.1}", at(k))).collect::<Vec<_>>().join(" ")
+    }
+
+    /// Slope of the least squares in MiB per hour, without the first third: caches fill.
+    pub(crate) fn slope(&self) -> f64 {
         let late = &self.0[self.0.len() / 3..];
         let count = late.len().max(1) as f64;
         let mean = |of: fn(&(f64, f64)) -> f64| late.iter().map(of).sum::<f64>() / count;
@@ -105,6 +113,6 @@ impl Memory {
             above += (hour - x) * (mib - y);
             below += (hour - x) * (hour - x);
         }
-        (above / below, late.last().map_or(0.0, |at| at.1))
+        above / below
     }
 }
