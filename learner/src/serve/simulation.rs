@@ -42,7 +42,8 @@ const TRAININGS: u32 = 5;
 /// An iteration ends within this time while one actor is healthy and the durations of shards are known: that actor alone takes less
 /// than 4 s for all shards, and each may wait for a late lease of less than 1 s first.
 const BOUND: Duration = Duration::from_secs(10);
-/// The same after a start of the learner: it waits for a whole lease before it takes one for late.
+/// The same after a start of the learner: it waits for a whole lease before it takes one for late, and for a quarter of one for
+/// each further actor that fails in its turn.
 const FIRST_BOUND: Duration = Duration::from_secs(15 + 10);
 
 /// What is taken out of the product to see whether the simulation finds it.

@@ -9,6 +9,7 @@ use tokio::time::Instant;
 struct Out {
     oldest: Instant,
     newest: Instant,
+    leases: usize,
     /// Whether the process that asks has one of them.
     own: bool,
 }
@@ -22,8 +23,7 @@ impl Ledger {
         }
         let late = |(at, out): &(usize, Out)| {
             let slot = &self.plan[*at];
-            let age = asker.now.saturating_duration_since(out.newest);
-            !out.own && !slot.queued && age >= self.pace.late(slot.shard.kind) && !slot.avoids(asker.process, others)
+            !out.own && !slot.queued && asker.now >= self.late_at(*at, out) && !slot.avoids(asker.process, others)
         };
         self.out(asker.process).into_iter().filter(late).min_by_key(|(_, out)| out.oldest).map(|(at, _)| at)
     }
@@ -34,7 +34,13 @@ impl Ledger {
             return None;
         }
         let open = self.out(process).into_iter().filter(|(at, out)| !out.own && !self.plan[*at].queued);
-        open.map(|(at, out)| out.newest + self.pace.late(self.plan[at].shard.kind)).min()
+        open.map(|(at, out)| self.late_at(at, &out)).min()
+    }
+
+    /// When a shard that is out becomes late.
+    fn late_at(&self, at: usize, out: &Out) -> Instant {
+        let kind = self.plan[at].shard.kind;
+        out.newest + if out.leases == 1 { self.pace.late(kind) } else { self.pace.late_again(kind) }
     }
 
     /// The shards of the plan that are leased and not done.
@@ -44,9 +50,10 @@ impl Ledger {
             let open = self.position.get(&held.shard).filter(|&&at| self.plan[at].result.is_none());
             let Some(&at) = open else { continue };
             let own = held.process == process;
-            let out = shards.entry(at).or_insert(Out { oldest: held.since, newest: held.since, own });
+            let out = shards.entry(at).or_insert(Out { oldest: held.since, newest: held.since, leases: 0, own });
             out.oldest = out.oldest.min(held.since);
             out.newest = out.newest.max(held.since);
+            out.leases += 1;
             out.own |= own;
         }
         shards

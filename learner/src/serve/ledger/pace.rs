@@ -43,6 +43,12 @@ impl Pace {
         self.median(kind).map_or(self.lease, |median| (2 * median).max(SHORTEST))
     }
 
+    /// Age from which the newest of several leases of a shard is shared again. While nothing is known, the first one had a whole
+    /// lease already: an actor that fails in turn must not cost another.
+    pub(crate) fn late_again(&self, kind: ShardKind) -> Duration {
+        self.median(kind).map_or(self.lease / 4, |_| self.late(kind))
+    }
+
     /// Age from which a lease is worth a line in the log.
     pub(crate) fn stalled(&self, kind: ShardKind) -> Duration {
         self.median(kind).map_or(self.lease, |median| (5 * median).max(self.lease))
@@ -58,9 +64,11 @@ mod tests {
         let seconds = Duration::from_secs;
         let mut pace = Pace::new(seconds(15));
         assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (seconds(15), seconds(15)));
+        assert_eq!(pace.late_again(ShardKind::Train), seconds(15) / 4);
         [1, 9, 4].into_iter().for_each(|time| pace.took(ShardKind::Train, seconds(time)));
         assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (seconds(8), seconds(20)));
         assert_eq!(pace.late(ShardKind::Eval), seconds(15));
+        assert_eq!(pace.late_again(ShardKind::Train), seconds(8));
         (0..REMEMBERED).for_each(|_| pace.took(ShardKind::Train, Duration::from_millis(2)));
         assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (SHORTEST, seconds(15)));
     }

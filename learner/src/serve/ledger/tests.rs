@@ -278,6 +278,20 @@ fn asker(session: SessionId, now: Instant) -> Asker {
 }
 
 #[test]
+fn while_nothing_is_known_of_durations_only_the_first_lease_is_waited_for_in_full() {
+    let mut ledger = opened(1);
+    let start = Instant::now();
+    let mut lease = |session, now| ledger.lease(asker(session, now), Vec::new).map(|lease| lease.shard);
+    let shard = lease(A, start).unwrap();
+    assert_eq!(lease(B, start + LEASE * 9 / 10), None);
+    assert_eq!(lease(B, start + LEASE), Some(shard));
+    // The second one does not answer either.
+    assert_eq!(lease(SessionId(3), start + LEASE * 11 / 10), None);
+    assert_eq!(lease(SessionId(3), start + LEASE * 5 / 4), Some(shard));
+    assert_eq!(lease(SessionId(4), start + LEASE * 3 / 2), Some(shard));
+}
+
+#[test]
 fn a_late_shard_is_leased_once_more_and_the_first_result_counts() {
     let mut ledger = opened(2);
     let start = Instant::now();
