@@ -205,33 +205,20 @@ pub(crate) const TABLES: &[PaperTable] = &[
     },
 ];
 
-const fn learner(
-    name: &'static str,
-    id: &'static str,
-    configs: &'static [&'static str],
-    set: &'static [&'static str],
-    paper: &'static [Paper],
-) -> System {
+type Text = &'static str;
+type Texts = &'static [Text];
+
+const fn learner(name: Text, id: Text, configs: Texts, set: Texts, paper: &'static [Paper]) -> System {
     System { name, id, by: By::Learner { configs, set, set_large: &[] }, paper }
 }
 
 /// A learner of the paper's comparison: one configuration, and other batches for large teams.
-const fn baseline(
-    name: &'static str,
-    id: &'static str,
-    configs: &'static [&'static str],
-    paper: &'static [Paper],
-) -> System {
+const fn baseline(name: Text, id: Text, configs: Texts, paper: &'static [Paper]) -> System {
     System { name, id, by: By::Learner { configs, set: &[], set_large: LARGE_TEAM }, paper }
 }
 
 /// The same of a learner with a replay buffer.
-const fn off_policy(
-    name: &'static str,
-    id: &'static str,
-    configs: &'static [&'static str],
-    paper: &'static [Paper],
-) -> System {
+const fn off_policy(name: Text, id: Text, configs: Texts, paper: &'static [Paper]) -> System {
     System { name, id, by: By::Learner { configs, set: &[], set_large: LARGE_TEAM_OFF_POLICY }, paper }
 }
 
