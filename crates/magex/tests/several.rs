@@ -325,7 +325,7 @@ fn wall_time_ends_a_training_and_is_told() {
     assert!(place.read("out/tables.md").contains("| time |"));
     // The same command trains nothing; one with more time goes on from the folder of the run.
     let systems = "--systems mage-x,random";
-    let steps = |line: &str| place.json(&format!("{line} {systems}"))["cells"][0]["joint_env_steps"].as_u64().unwrap();
+    let steps = |line: &str| place.json(&format!("{line} {systems}"))["cells"][0]["joint_env_steps"].as_f64().unwrap();
     let first = steps(line);
     let before = place.read("out/runs/spread/mage-x-5/seed-1/metrics.jsonl");
     assert_eq!(steps(line), first);

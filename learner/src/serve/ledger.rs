@@ -75,7 +75,10 @@ struct Slot {
     shard: Shard,
     result: Option<(ShardResult, Origin)>,
     queued: bool,
+    /// Leases that are out.
     leases: u32,
+    /// Leases that there have been.
+    granted: u32,
     failures: u32,
     /// Processes and names of the actors at which it failed permanently.
     failed_at: Vec<(u64, String)>,
@@ -169,6 +172,7 @@ impl Ledger {
             result: None,
             queued: true,
             leases: 0,
+            granted: 0,
             failures: 0,
             failed_at: Vec::new(),
             given_back: Vec::new(),
@@ -189,7 +193,8 @@ impl Ledger {
             return Some(lease);
         }
         let at = self.queued_for(asker.process, &others).or_else(|| self.late_for(&asker, &others))?;
-        self.plan[at].leases += 1;
+        let slot = &mut self.plan[at];
+        (slot.leases, slot.granted) = (slot.leases + 1, slot.granted.saturating_add(1));
         Some(self.grant(&asker, self.plan[at].shard))
     }
 

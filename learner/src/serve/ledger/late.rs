@@ -1,6 +1,7 @@
 //! Leases that are late: their shards are leased once more, to an actor that is idle.
 
-use super::{Asker, Ledger};
+use super::{Asker, Ledger, Slot};
+use magex_core::ids::Shard;
 use std::collections::BTreeMap;
 use tokio::time::Instant;
 
@@ -9,7 +10,6 @@ use tokio::time::Instant;
 struct Out {
     oldest: Instant,
     newest: Instant,
-    leases: usize,
     /// Whether the process that asks has one of them.
     own: bool,
 }
@@ -39,8 +39,8 @@ impl Ledger {
 
     /// When a shard that is out becomes late.
     fn late_at(&self, at: usize, out: &Out) -> Instant {
-        let kind = self.plan[at].shard.kind;
-        out.newest + if out.leases == 1 { self.pace.late(kind) } else { self.pace.late_again(kind) }
+        let Slot { shard: Shard { kind, .. }, granted, .. } = self.plan[at];
+        out.newest + if granted <= 1 { self.pace.late(kind) } else { self.pace.late_again(kind) }
     }
 
     /// The shards of the plan that are leased and not done.
@@ -50,10 +50,9 @@ impl Ledger {
             let open = self.position.get(&held.shard).filter(|&&at| self.plan[at].result.is_none());
             let Some(&at) = open else { continue };
             let own = held.process == process;
-            let out = shards.entry(at).or_insert(Out { oldest: held.since, newest: held.since, leases: 0, own });
+            let out = shards.entry(at).or_insert(Out { oldest: held.since, newest: held.since, own });
             out.oldest = out.oldest.min(held.since);
             out.newest = out.newest.max(held.since);
-            out.leases += 1;
             out.own |= own;
         }
         shards

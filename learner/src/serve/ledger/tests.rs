@@ -292,6 +292,18 @@ fn while_nothing_is_known_of_durations_only_the_first_lease_is_waited_for_in_ful
 }
 
 #[test]
+fn a_lease_that_is_lost_counts_among_those_that_were_waited_for() {
+    let mut ledger = opened(1);
+    let start = Instant::now();
+    let shard = ledger.lease(asker(A, start), Vec::new).unwrap().shard;
+    assert!(ledger.lease(asker(B, start + LEASE), Vec::new).is_some());
+    ledger.drop_actor(A);
+    assert_eq!(ledger.lease(asker(SessionId(3), start + LEASE * 11 / 10), Vec::new), None);
+    let third = ledger.lease(asker(SessionId(3), start + LEASE * 5 / 4), Vec::new);
+    assert_eq!(third.map(|lease| lease.shard), Some(shard));
+}
+
+#[test]
 fn a_late_shard_is_leased_once_more_and_the_first_result_counts() {
     let mut ledger = opened(2);
     let start = Instant::now();
