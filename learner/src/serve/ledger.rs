@@ -75,9 +75,8 @@ struct Slot {
     shard: Shard,
     result: Option<(ShardResult, Origin)>,
     queued: bool,
-    /// Leases that are out.
     leases: u32,
-    /// Leases that there have been.
+    /// Leases that there have been; `leases` are out.
     granted: u32,
     failures: u32,
     /// Processes and names of the actors at which it failed permanently.

@@ -43,8 +43,7 @@ impl Pace {
         self.median(kind).map_or(self.lease, |median| (2 * median).max(SHORTEST))
     }
 
-    /// Age from which a lease is shared that is not the first one of its shard. While nothing is known, the first one had a whole
-    /// lease already: an actor that fails in turn must not cost another.
+    /// The same of a lease that is not the first one of its shard: actors that fail in turn must not cost a whole lease each.
     pub(crate) fn late_again(&self, kind: ShardKind) -> Duration {
         self.median(kind).map_or(self.lease / 4, |_| self.late(kind))
     }
