@@ -45,6 +45,8 @@ const BOUND: Duration = Duration::from_secs(10);
 /// The same after a start of the learner: it waits for a whole lease before it takes one for late, and for a quarter of one for
 /// each further actor that fails in its turn.
 const FIRST_BOUND: Duration = Duration::from_secs(15 + 10);
+/// After so many iterations the learner knows what is usual, even where an actor that froze had the first shard of a kind.
+const LEARNED: usize = 3;
 
 /// What is taken out of the product to see whether the simulation finds it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -198,18 +200,18 @@ impl World {
         while iteration < ITERATIONS {
             let process = self.learner();
             let mut collector = self.collector(&process);
-            let mut first = true;
+            let mut known = 0;
             while iteration < ITERATIONS && !process.gone.is_cancelled() {
                 collector.publish(&weights(iteration)).unwrap();
                 let trained = process.shared.work.inspect(|ledger| ledger.counters().trained);
                 self.trained_before.set(trained);
                 collector.open(plan(iteration)).unwrap();
-                match self.collect(&process, &mut collector, if first { FIRST_BOUND } else { BOUND }).await {
+                match self.collect(&process, &mut collector, Self::bound(&process, known)).await {
                     None => break,
                     Some(Ok(results)) => {
                         let shards: Vec<Shard> = results.iter().map(|result| *result.shard()).collect();
                         assert_eq!(shards, plan(iteration), "seed {}", self.seed);
-                        first = false;
+                        known += 1;
                     }
                     Some(Err(CollectError::Convicted(conviction))) => {
                         let liar = self.liars.borrow().contains(&conviction.origin.process);
@@ -220,7 +222,7 @@ impl World {
                             checkpoint = checkpoint.min(since);
                             collector.went_back(since);
                         }
-                        first = true;
+                        known = 0;
                         continue;
                     }
                     Some(Err(error)) => panic!("seed {}: {error}", self.seed),
@@ -248,6 +250,14 @@ impl World {
             origins: Vec::new(),
             unconfirmed: BTreeMap::new(),
         }
+    }
+
+    /// The time of an iteration when the process has ended `known` of them.
+    fn bound(process: &Process, known: usize) -> Duration {
+        let kinds = [ShardKind::Train, ShardKind::Eval];
+        let late = process.shared.work.inspect(|ledger| kinds.map(|kind| ledger.late(kind)).into_iter().max());
+        let unsure = known == 0 || known < LEARNED && late > Some(Duration::from_secs(1));
+        if unsure { FIRST_BOUND } else { BOUND }
     }
 
     /// The results of the open plan, which arrive in time; `None` if the learner is killed.

@@ -8,6 +8,14 @@ use std::time::Duration;
 const REMEMBERED: usize = 31;
 /// A lease that is younger is never late: shards of milliseconds differ by more than a factor.
 const SHORTEST: Duration = Duration::from_millis(100);
+/// Fewer durations than this say what is possible, not what is usual.
+const FEW: usize = 5;
+
+/// What is known of the durations of a kind.
+struct Usual {
+    time: Option<Duration>,
+    few: bool,
+}
 
 #[derive(Debug)]
 pub(crate) struct Pace {
@@ -30,27 +38,40 @@ impl Pace {
         }
     }
 
-    fn median(&self, kind: ShardKind) -> Option<Duration> {
+    /// The median, or the shortest of a few: where the first shards of a kind went to actors that froze, the median of a few would
+    /// be their silence, and the next such shard would wait for twice of it.
+    fn usual(&self, kind: ShardKind) -> Usual {
         let mut sorted: Vec<Duration> = self.recent[usize::from(kind == ShardKind::Eval)].iter().copied().collect();
         sorted.sort_unstable();
-        sorted.get(sorted.len() / 2).copied()
+        let at = if sorted.len() < FEW { 0 } else { sorted.len() / 2 };
+        Usual { time: sorted.get(at).copied(), few: sorted.len() < FEW }
     }
 
     /// Age from which a lease is shared with an idle actor: twice what is usual, or the time of a lease while nothing is known.
     /// Shorter, and in undisturbed runs actors would repeat shards that are about to arrive, and still be at it when the next
     /// plan opens.
     pub(crate) fn late(&self, kind: ShardKind) -> Duration {
-        self.median(kind).map_or(self.lease, |median| (2 * median).max(SHORTEST))
+        self.late_or(kind, self.lease)
     }
 
     /// The same of a lease that is not the first one of its shard: actors that fail in turn must not cost a whole lease each.
     pub(crate) fn late_again(&self, kind: ShardKind) -> Duration {
-        self.median(kind).map_or(self.lease / 4, |_| self.late(kind))
+        self.late_or(kind, self.lease / 4)
+    }
+
+    /// `first` is the age while little is known, unless the little that is known says less.
+    fn late_or(&self, kind: ShardKind, first: Duration) -> Duration {
+        let Usual { time, few } = self.usual(kind);
+        match time.map(|time| (2 * time).max(SHORTEST)) {
+            None => first,
+            Some(late) if few => late.min(first),
+            Some(late) => late,
+        }
     }
 
     /// Age from which a lease is worth a line in the log.
     pub(crate) fn stalled(&self, kind: ShardKind) -> Duration {
-        self.median(kind).map_or(self.lease, |median| (5 * median).max(self.lease))
+        self.usual(kind).time.map_or(self.lease, |time| (5 * time).max(self.lease))
     }
 }
 
@@ -64,11 +85,25 @@ mod tests {
         let mut pace = Pace::new(seconds(15));
         assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (seconds(15), seconds(15)));
         assert_eq!(pace.late_again(ShardKind::Train), seconds(15) / 4);
-        [1, 9, 4].into_iter().for_each(|time| pace.took(ShardKind::Train, seconds(time)));
-        assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (seconds(8), seconds(20)));
+        [1, 9, 4, 20, 20].into_iter().for_each(|time| pace.took(ShardKind::Train, seconds(time)));
+        assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (seconds(18), seconds(45)));
         assert_eq!(pace.late(ShardKind::Eval), seconds(15));
-        assert_eq!(pace.late_again(ShardKind::Train), seconds(8));
+        assert_eq!(pace.late_again(ShardKind::Train), seconds(18));
         (0..REMEMBERED).for_each(|_| pace.took(ShardKind::Train, Duration::from_millis(2)));
         assert_eq!((pace.late(ShardKind::Train), pace.stalled(ShardKind::Train)), (SHORTEST, seconds(15)));
+    }
+
+    #[test]
+    fn while_few_are_known_the_shortest_counts_and_a_lease_is_the_most() {
+        let seconds = Duration::from_secs;
+        let mut pace = Pace::new(seconds(15));
+        // The first shard of its kind went to an actor that froze.
+        pace.took(ShardKind::Eval, seconds(14));
+        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(15), seconds(15) / 4));
+        [6, 14].into_iter().for_each(|time| pace.took(ShardKind::Eval, seconds(time)));
+        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(12), seconds(15) / 4));
+        // Shards that do take longer than a lease: known as soon as there are more than a few.
+        [14, 14].into_iter().for_each(|time| pace.took(ShardKind::Eval, seconds(time)));
+        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(28), seconds(28)));
     }
 }
