@@ -4,6 +4,11 @@
 use std::cell::RefCell;
 use std::ops::{Deref, DerefMut};
 
+/// Bytes of a line of the caches: vectors that begin on one cross none.
+const LINE: usize = 64;
+/// Numbers that fit into it.
+const ALIGNED: usize = LINE / size_of::<f32>();
+
 /// Vectors that a thread keeps.
 const KEPT: usize = 24;
 
@@ -11,26 +16,29 @@ thread_local! {
     static FREE: RefCell<Vec<Vec<f32>>> = const { RefCell::new(Vec::new()) };
 }
 
-/// Numbers of no account: a buffer is written before it is read.
+/// Numbers of no account: a buffer is written before it is read. It begins on a line of the caches.
 #[derive(Default)]
 pub(crate) struct Buffer {
     values: Vec<f32>,
+    start: usize,
     len: usize,
 }
 
 impl Buffer {
     /// The smallest kept vector that is large enough, or a new one.
     pub(crate) fn take(len: usize) -> Self {
+        let room = len + ALIGNED;
         let kept = FREE.with_borrow_mut(|free| {
-            let fits = free.iter().enumerate().filter(|(_, v)| v.capacity() >= len);
+            let fits = free.iter().enumerate().filter(|(_, v)| v.capacity() >= room);
             let best = fits.min_by_key(|(_, v)| v.capacity()).map(|(at, _)| at);
             best.map(|at| free.swap_remove(at))
         });
         let mut values = kept.unwrap_or_default();
-        if values.len() < len {
-            values.resize(len, 0.0);
+        if values.len() < room {
+            values.resize(room, 0.0);
         }
-        Self { values, len }
+        let start = values.as_ptr().align_offset(LINE).min(ALIGNED);
+        Self { values, start, len }
     }
 }
 
@@ -58,12 +66,12 @@ impl Deref for Buffer {
     type Target = [f32];
 
     fn deref(&self) -> &[f32] {
-        &self.values[..self.len]
+        &self.values[self.start..self.start + self.len]
     }
 }
 
 impl DerefMut for Buffer {
     fn deref_mut(&mut self) -> &mut [f32] {
-        &mut self.values[..self.len]
+        &mut self.values[self.start..self.start + self.len]
     }
 }

@@ -5,8 +5,8 @@ use super::matmul::Rows;
 use super::simd::{LANES, WIDE, load, store};
 use wide::f32x16;
 
-/// Rows that pass over a tile of sums while it is in registers, few enough for x and dz to stay in the first cache level.
-const BLOCK: usize = 64;
+/// Rows that pass over a tile of sums while it is in registers: a tile of a chain, few enough for dz to stay in the first cache level.
+const BLOCK: usize = 96;
 
 /// Vectors of a row of sums that are in registers at once, at most.
 const VECTORS: usize = if WIDE { 4 } else { 1 };
