@@ -19,19 +19,8 @@ pub struct BottleneckSolver {
 impl BottleneckSolver {
     /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where +∞ forbids a pair; among those the smallest largest
     /// cost, then the smallest sum, then the lowest matching. Costs of d^p make the sum one of d^p among the same smallest
-    /// largest distances. Stops as soon as `should_continue` returns false. Fails as [`Solver::solve_allowed`].
-    pub fn solve_allowed(
-        &mut self,
-        cost: &[f64],
-        rows: usize,
-        cols: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Assignment, AssignError> {
-        self.solve_switching(cost, rows, cols, &Switching::default(), should_continue)
-    }
-
-    /// The same where some pairs are in force: a pair of a row that leaves its column costs the switching cost more. Minimises
-    /// the largest of these costs, then summed cost + switching cost × rows that leave, then the number of rows that do.
+    /// largest distances. Where some pairs are in force, a pair of a row that leaves its column costs the switching cost more;
+    /// the number of rows that do comes after the sum. Stops as soon as `should_continue` returns false.
     /// Fails as [`Solver::solve_switching`].
     pub fn solve_switching(
         &mut self,

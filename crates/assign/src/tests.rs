@@ -104,7 +104,7 @@ fn a_solver_that_is_told_to_stop_stops_and_can_be_used_again() {
     let cost = distances(&agents, &goals, 2).unwrap();
     let mut solver = Solver::default();
     assert_eq!(solver.solve_allowed(&cost, 60, 60, &|| false), Err(AssignError::Interrupted));
-    let stopped = BottleneckSolver::default().solve_allowed(&cost, 60, 60, &|| false);
+    let stopped = BottleneckSolver::default().solve_switching(&cost, 60, 60, &Switching::default(), &|| false);
     assert_eq!(stopped, Err(AssignError::Interrupted));
     let large = vec![1.0; 300 * 300];
     assert_eq!(greedy(&large, 300, 300, &|| false), Err(AssignError::Interrupted));
@@ -182,7 +182,7 @@ proptest! {
         let answer = Solver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
         prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
         prop_assert!(close(answer.cost, sum, &finite), "{} instead of {sum}", answer.cost);
-        let answer = BottleneckSolver::default().solve_allowed(cost, rows, cols, &|| true).unwrap();
+        let answer = BottleneckSolver::default().solve_switching(cost, rows, cols, &Switching::default(), &|| true).unwrap();
         prop_assert!(allowed(&answer) && answer.pairs().count() == pairs);
         prop_assert_eq!(largest_of(&problem, &answer), largest);
         prop_assert!(close(answer.cost, within, &finite), "{} not {within}", answer.cost);
@@ -200,7 +200,7 @@ proptest! {
         let answer = exact(cost, *rows, *cols).unwrap();
         check_matching(&problem, &answer);
         prop_assert!(close(answer.cost, sum, cost), "{} instead of {sum}", answer.cost);
-        let answer = BottleneckSolver::default().solve_allowed(cost, *rows, *cols, &|| true).unwrap();
+        let answer = BottleneckSolver::default().solve_switching(cost, *rows, *cols, &Switching::default(), &|| true).unwrap();
         check_matching(&problem, &answer);
         prop_assert_eq!(largest_of(&problem, &answer), largest);
         prop_assert!(close(answer.cost, within, cost), "{} instead of {within}", answer.cost);

@@ -17,7 +17,7 @@ use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
 use candle_core::Tensor;
 use magex_assign::random::random;
-use magex_assign::{AssignError, BottleneckSolver, Solver, distance, exact_points, greedy, powered};
+use magex_assign::{AssignError, BottleneckSolver, Solver, Switching, distance, exact_points, greedy, powered};
 use magex_core::config::{CommanderConfig, CommanderPolicy};
 use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose, Stream};
@@ -226,5 +226,7 @@ fn greedy_goals(team: &Team<'_>) -> Result<Vec<u32>, AssignError> {
 /// The goals with the shortest longest distance; among those the least sum of powers.
 fn shortest_longest(team: &Team<'_>, power: f64) -> Result<Vec<u32>, AssignError> {
     let costs = powers(team, power);
-    Ok(BottleneckSolver::default().solve_allowed(&costs, team.agent_count(), team.goal_count(), &|| true)?.col_of_row)
+    Ok(BottleneckSolver::default()
+        .solve_switching(&costs, team.agent_count(), team.goal_count(), &Switching::default(), &|| true)?
+        .col_of_row)
 }

@@ -45,7 +45,7 @@ const BOUND: Duration = Duration::from_secs(10);
 /// The same after a start of the learner: it waits for a whole lease before it takes one for late, and for a quarter of one for
 /// each further actor that fails in its turn.
 const FIRST_BOUND: Duration = Duration::from_secs(15 + 10);
-/// After so many iterations the learner knows what is usual, even where an actor that froze had the first shard of a kind.
+/// After this number of iterations the learner knows what is usual, even where an actor that froze had the first shard of a kind.
 const LEARNED: usize = 3;
 
 /// What is taken out of the product to see whether the simulation finds it.

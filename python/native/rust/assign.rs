@@ -66,7 +66,7 @@ pub(crate) fn assign_costs<'py>(
         |row, col| costs[row * cols + col],
         |go_on| {
             if bottleneck {
-                BottleneckSolver::default().solve_allowed(costs, rows, cols, go_on)
+                BottleneckSolver::default().solve_switching(costs, rows, cols, &Switching::default(), go_on)
             } else {
                 Solver::default().solve_allowed(costs, rows, cols, go_on)
             }

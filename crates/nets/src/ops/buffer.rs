@@ -6,8 +6,6 @@ use std::ops::{Deref, DerefMut};
 
 /// Bytes of a line of the caches: vectors that begin on one cross none.
 const LINE: usize = 64;
-/// Numbers that fit into it.
-const ALIGNED: usize = LINE / size_of::<f32>();
 
 /// Vectors that a thread keeps.
 const KEPT: usize = 24;
@@ -27,7 +25,7 @@ pub(crate) struct Buffer {
 impl Buffer {
     /// The smallest kept vector that is large enough, or a new one.
     pub(crate) fn take(len: usize) -> Self {
-        let room = len + ALIGNED;
+        let room = len + LINE / size_of::<f32>();
         let kept = FREE.with_borrow_mut(|free| {
             let fits = free.iter().enumerate().filter(|(_, v)| v.capacity() >= room);
             let best = fits.min_by_key(|(_, v)| v.capacity()).map(|(at, _)| at);
@@ -37,7 +35,7 @@ impl Buffer {
         if values.len() < room {
             values.resize(room, 0.0);
         }
-        let start = values.as_ptr().align_offset(LINE).min(ALIGNED);
+        let start = values.as_ptr().align_offset(LINE).min(room - len);
         Self { values, start, len }
     }
 }

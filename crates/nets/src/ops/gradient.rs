@@ -34,8 +34,7 @@ impl Gradient {
     /// Takes in some rows: x [rows, k] and dz [rows, n], in whole vectors (what stands beyond column n is of no account).
     pub(crate) fn add(&mut self, x: Rows<'_>, dz: Rows<'_>, rows: usize) {
         let (k, n, padded) = (self.k, self.n, self.db.len());
-        let mut first = 0;
-        while first < rows {
+        for first in (0..rows).step_by(BLOCK) {
             let count = BLOCK.min(rows - first);
             let x = x.skip(first * x.stride);
             let dz = dz.skip(first * dz.stride);
@@ -54,7 +53,6 @@ impl Gradient {
             } else {
                 block(x, k, dz, padded, &mut self.dw, count, VECTORS);
             }
-            first += count;
         }
     }
 

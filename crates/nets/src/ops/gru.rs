@@ -231,16 +231,8 @@ impl Operation<2> for Op {
                         &mut d_state[i * triple..][..triple],
                     );
                 }
-                let (identity, count) = (Activation::Identity, tile.len());
-                layer(
-                    Rows::new(d_input, triple),
-                    to_input,
-                    Start::Zero,
-                    identity,
-                    &mut dx[inputs],
-                    self.sizes.inputs,
-                    count,
-                );
+                let (identity, count, dx) = (Activation::Identity, tile.len(), &mut dx[inputs]);
+                layer(Rows::new(d_input, triple), to_input, Start::Zero, identity, dx, self.sizes.inputs, count);
                 layer(Rows::new(d_state, triple), to_state, Start::Output, identity, dh, hidden, count);
                 // A sequence that began here has no step before.
                 if let Some(firsts) = self.firsts.get(t * rows + tile.start..t * rows + tile.end) {

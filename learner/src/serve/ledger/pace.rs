@@ -11,12 +11,6 @@ const SHORTEST: Duration = Duration::from_millis(100);
 /// Fewer durations than this say what is possible, not what is usual.
 const FEW: usize = 5;
 
-/// What is known of the durations of a kind.
-struct Usual {
-    time: Option<Duration>,
-    few: bool,
-}
-
 #[derive(Debug)]
 pub(crate) struct Pace {
     /// From grant to result, of the latest training and evaluation shards.
@@ -40,11 +34,11 @@ impl Pace {
 
     /// The median, or the shortest of a few: where the first shards of a kind went to actors that froze, the median of a few would
     /// be their silence, and the next such shard would wait for twice of it.
-    fn usual(&self, kind: ShardKind) -> Usual {
+    fn usual(&self, kind: ShardKind) -> (Option<Duration>, bool) {
         let mut sorted: Vec<Duration> = self.recent[usize::from(kind == ShardKind::Eval)].iter().copied().collect();
         sorted.sort_unstable();
-        let at = if sorted.len() < FEW { 0 } else { sorted.len() / 2 };
-        Usual { time: sorted.get(at).copied(), few: sorted.len() < FEW }
+        let few = sorted.len() < FEW;
+        (sorted.get(if few { 0 } else { sorted.len() / 2 }).copied(), few)
     }
 
     /// Age from which a lease is shared with an idle actor: twice what is usual, or the time of a lease while nothing is known.
@@ -61,17 +55,15 @@ impl Pace {
 
     /// `first` is the age while little is known, unless the little that is known says less.
     fn late_or(&self, kind: ShardKind, first: Duration) -> Duration {
-        let Usual { time, few } = self.usual(kind);
-        match time.map(|time| (2 * time).max(SHORTEST)) {
-            None => first,
-            Some(late) if few => late.min(first),
-            Some(late) => late,
+        match self.usual(kind) {
+            (None, _) => first,
+            (Some(time), few) => (2 * time).max(SHORTEST).min(if few { first } else { Duration::MAX }),
         }
     }
 
     /// Age from which a lease is worth a line in the log.
     pub(crate) fn stalled(&self, kind: ShardKind) -> Duration {
-        self.usual(kind).time.map_or(self.lease, |time| (5 * time).max(self.lease))
+        self.usual(kind).0.map_or(self.lease, |time| (5 * time).max(self.lease))
     }
 }
 

@@ -67,16 +67,16 @@ impl Op {
     fn teams(&self, rows: usize, packs: &[Pack], p: &[f32]) -> Result<Vec<(Buffer, usize)>> {
         let mut out = Vec::new();
         for (branch, pack) in self.layout.branches.iter().zip(packs) {
-            out.push((Buffer::default(), 1));
+            let mut own = (Buffer::default(), 1);
             if let (Branch::Features(d, _, Some((width, _, field))), Pack::Two(_, w)) = (branch, pack) {
                 let states = field(&self.features);
                 let sharing = self.sharing(rows, states, *width)?;
                 let mut team = Buffer::take(rows / sharing * d.n);
                 let bias = Start::Bias(&p[d.bias()]);
                 layer(Rows::new(states, *width), w, bias, Activation::Identity, &mut team, d.n, rows / sharing);
-                out.pop();
-                out.push((team, sharing));
+                own = (team, sharing);
             }
+            out.push(own);
         }
         Ok(out)
     }
