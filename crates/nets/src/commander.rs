@@ -225,8 +225,6 @@ fn greedy_goals(team: &Team<'_>) -> Result<Vec<u32>, AssignError> {
 
 /// The goals with the shortest longest distance; among those the least sum of powers.
 fn shortest_longest(team: &Team<'_>, power: f64) -> Result<Vec<u32>, AssignError> {
-    let costs = powers(team, power);
-    Ok(BottleneckSolver::default()
-        .solve_switching(&costs, team.agent_count(), team.goal_count(), &Switching::default(), &|| true)?
-        .col_of_row)
+    let (costs, agents, goals) = (powers(team, power), team.agent_count(), team.goal_count());
+    Ok(BottleneckSolver::default().solve_switching(&costs, agents, goals, &Switching::default(), &|| true)?.col_of_row)
 }

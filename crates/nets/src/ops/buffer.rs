@@ -48,14 +48,13 @@ impl Drop for Buffer {
         }
         // A thread that ends has no list any more.
         let _ = FREE.try_with(|free| {
-            if let Ok(mut free) = free.try_borrow_mut() {
-                if free.len() >= KEPT
-                    && let Some(least) = free.iter().enumerate().min_by_key(|(_, v)| v.capacity()).map(|(at, _)| at)
-                {
-                    free.swap_remove(least);
-                }
-                free.push(values);
+            let Ok(mut free) = free.try_borrow_mut() else { return };
+            if free.len() >= KEPT
+                && let Some(least) = free.iter().enumerate().min_by_key(|(_, v)| v.capacity()).map(|(at, _)| at)
+            {
+                free.swap_remove(least);
             }
+            free.push(values);
         });
     }
 }

@@ -39,14 +39,12 @@ impl Gradient {
             let x = x.skip(first * x.stride);
             let dz = dz.skip(first * dz.stride);
             // Several sums at once hide the latency of an addition; each has its own order either way.
-            let mut v = 0;
-            while v + 4 * LANES <= padded {
+            let fours = padded / (4 * LANES) * 4 * LANES;
+            for v in (0..fours).step_by(4 * LANES) {
                 bias::<4>(dz.skip(v), &mut self.db[v..], count);
-                v += 4 * LANES;
             }
-            while v < padded {
+            for v in (fours..padded).step_by(LANES) {
                 bias::<1>(dz.skip(v), &mut self.db[v..], count);
-                v += LANES;
             }
             if self.transposed {
                 block(dz, n, x, k, &mut self.dw, count, VECTORS);
