@@ -255,10 +255,12 @@ mod tests {
                 assert!([0, table.tasks.len()].contains(&system.paper.len()), "{place}: the paper's values");
                 let By::Learner { configs, set, .. } = &system.by else { continue };
                 assert!([1, table.tasks.len()].contains(&configs.len()), "{place}");
-                let settings: Vec<Setting> = set.iter().map(|text| text.parse().unwrap()).collect();
                 for (k, task) in table.tasks.iter().enumerate() {
-                    let config = RunConfig::from_toml_with(configs.get(k).unwrap_or(&configs[0]), &settings).unwrap();
                     let own = RunConfig::from_toml(task.config).unwrap();
+                    let name = format!("task.name={}", own.task.name);
+                    let settings = set.iter().copied().chain([&name[..]]).map(|text| text.parse().unwrap());
+                    let settings: Vec<Setting> = settings.collect();
+                    let config = RunConfig::from_toml_with(configs.get(k).unwrap_or(&configs[0]), &settings).unwrap();
                     assert_eq!(own.task.agents, task.agents, "{place}");
                     assert!(configs.len() == 1 || config.task.agents == task.agents, "{place}");
                 }
