@@ -42,11 +42,8 @@ const TRAININGS: u32 = 5;
 /// An iteration ends within this time while one actor is healthy and the durations of shards are known: that actor alone takes less
 /// than 4 s for all shards, and each may wait for a late lease of less than 1 s first.
 const BOUND: Duration = Duration::from_secs(10);
-/// The same after a start of the learner: it waits for a whole lease before it takes one for late, and for a quarter of one for
-/// each further actor that fails in its turn.
+/// The same after a start of the learner: it waits for a whole lease before it takes one for late.
 const FIRST_BOUND: Duration = Duration::from_secs(15 + 10);
-/// After this number of iterations the learner knows what is usual, even where an actor that froze had the first shard of a kind.
-const LEARNED: usize = 3;
 
 /// What is taken out of the product to see whether the simulation finds it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -200,18 +197,18 @@ impl World {
         while iteration < ITERATIONS {
             let process = self.learner();
             let mut collector = self.collector(&process);
-            let mut known = 0;
+            let mut first = true;
             while iteration < ITERATIONS && !process.gone.is_cancelled() {
                 collector.publish(&weights(iteration)).unwrap();
                 let trained = process.shared.work.inspect(|ledger| ledger.counters().trained);
                 self.trained_before.set(trained);
                 collector.open(plan(iteration)).unwrap();
-                match self.collect(&process, &mut collector, Self::bound(&process, known)).await {
+                match self.collect(&process, &mut collector, if first { FIRST_BOUND } else { BOUND }).await {
                     None => break,
                     Some(Ok(results)) => {
                         let shards: Vec<Shard> = results.iter().map(|result| *result.shard()).collect();
                         assert_eq!(shards, plan(iteration), "seed {}", self.seed);
-                        known += 1;
+                        first = false;
                     }
                     Some(Err(CollectError::Convicted(conviction))) => {
                         let liar = self.liars.borrow().contains(&conviction.origin.process);
@@ -222,7 +219,7 @@ impl World {
                             checkpoint = checkpoint.min(since);
                             collector.went_back(since);
                         }
-                        known = 0;
+                        first = true;
                         continue;
                     }
                     Some(Err(error)) => panic!("seed {}: {error}", self.seed),
@@ -250,14 +247,6 @@ impl World {
             origins: Vec::new(),
             unconfirmed: BTreeMap::new(),
         }
-    }
-
-    /// The time of an iteration when the process has ended `known` of them.
-    fn bound(process: &Process, known: usize) -> Duration {
-        let kinds = [ShardKind::Train, ShardKind::Eval];
-        let late = process.shared.work.inspect(|ledger| kinds.map(|kind| ledger.late(kind)).into_iter().max());
-        let unsure = known == 0 || known < LEARNED && late > Some(Duration::from_secs(1));
-        if unsure { FIRST_BOUND } else { BOUND }
     }
 
     /// The results of the open plan, which arrive in time; `None` if the learner is killed.

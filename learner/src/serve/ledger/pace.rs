@@ -53,11 +53,11 @@ impl Pace {
         self.late_or(kind, self.lease / 4)
     }
 
-    /// `first` is the age while little is known, unless the little that is known says less.
+    /// `first` is the age while nothing is known; a quarter of a lease is the most while little is.
     fn late_or(&self, kind: ShardKind, first: Duration) -> Duration {
         match self.usual(kind) {
             (None, _) => first,
-            (Some(time), few) => (2 * time).max(SHORTEST).min(if few { first } else { Duration::MAX }),
+            (Some(time), few) => (2 * time).max(SHORTEST).min(if few { self.lease / 4 } else { Duration::MAX }),
         }
     }
 
@@ -86,14 +86,14 @@ mod tests {
     }
 
     #[test]
-    fn while_few_are_known_the_shortest_counts_and_a_lease_is_the_most() {
+    fn while_few_are_known_the_shortest_counts_and_a_quarter_of_a_lease_is_the_most() {
         let seconds = Duration::from_secs;
         let mut pace = Pace::new(seconds(15));
         // The first shard of its kind went to an actor that froze.
         pace.took(ShardKind::Eval, seconds(14));
-        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(15), seconds(15) / 4));
-        [6, 14].into_iter().for_each(|time| pace.took(ShardKind::Eval, seconds(time)));
-        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(12), seconds(15) / 4));
+        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(15) / 4, seconds(15) / 4));
+        [1, 14].into_iter().for_each(|time| pace.took(ShardKind::Eval, seconds(time)));
+        assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(2), seconds(2)));
         // Shards that do take longer than a lease: known as soon as there are more than a few.
         [14, 14].into_iter().for_each(|time| pace.took(ShardKind::Eval, seconds(time)));
         assert_eq!((pace.late(ShardKind::Eval), pace.late_again(ShardKind::Eval)), (seconds(28), seconds(28)));
