@@ -269,6 +269,10 @@ impl Features {
     /// Appends the rows `from..from + count` of the `rows` of `other`: whole joint states of N agents.
     pub fn append(&mut self, other: &Self, (from, count): (usize, usize), rows: usize, agents: usize) {
         fn copy<T: Copy>(to: &mut Vec<T>, source: &[T], from: usize, count: usize, rows: usize) {
+            // Most kinds of features are not there: no division for them.
+            if source.is_empty() {
+                return;
+            }
             let width = source.len() / rows.max(1);
             to.extend_from_slice(&source[from * width..(from + count) * width]);
         }

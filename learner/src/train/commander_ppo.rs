@@ -201,10 +201,10 @@ impl CommanderPpo {
                     .iter()
                     .flat_map(|&i| std::iter::repeat_n(samples[i].advantage * scale, samples[i].picks.len()))
                     .collect();
-                let ratio = ops::exp(&(now.get(0)? - column(old)?)?)?;
+                let ratio = ops::exp(&ops::minus(&ops::row(&now, 0)?, &column(old)?)?)?;
                 let surrogate = clipped_surrogate(&ratio, &column(advantage)?, c.clip)?;
                 let mean = |x: Tensor| -> candle_core::Result<Tensor> { x.sum_all()?.affine(1.0 / rows as f64, 0.0) };
-                let (surrogate, entropy) = (mean(surrogate)?, mean(now.get(1)?)?);
+                let (surrogate, entropy) = (mean(surrogate)?, mean(ops::row(&now, 1)?)?);
                 let loss = (surrogate.neg()? - (&entropy * f64::from(c.entropy))?)?;
                 let (surrogate, entropy) = (surrogate.to_scalar::<f32>()?, entropy.to_scalar::<f32>()?);
                 // Adam takes no step along a gradient that is not finite.

@@ -329,7 +329,7 @@ impl Mappo {
 
         // Rows of agents that do not act have the ratio 1, no advantage and no entropy.
         let active = slice.active()?;
-        let log_ratio = only(active.as_ref(), (now.log_probs - slice.column(&slice.batch.log_probs)?)?)?;
+        let log_ratio = only(active.as_ref(), ops::minus(&now.log_probs, &slice.column(&slice.batch.log_probs)?)?)?;
         let entropies = only(active.as_ref(), now.entropies)?;
         let (log_ratio, advantages, entropies, agents) = if m.joint_ratio {
             let agents = slice.batch.shape.agents;
@@ -414,22 +414,15 @@ impl Mappo {
 
 /// min(ρ A, clip(ρ, 1 ± ε) A), element by element.
 pub(crate) fn clipped_surrogate(ratio: &Tensor, advantages: &Tensor, clip: f32) -> CandleResult<Tensor> {
-    let clipped = (ops::clamp(ratio, 1.0 - clip, 1.0 + clip)? * advantages)?;
-    (ratio * advantages)?.minimum(&clipped)
+    let clipped = ops::times(&ops::clamp(ratio, 1.0 - clip, 1.0 + clip)?, advantages)?;
+    ops::minimum(&ops::times(ratio, advantages)?, &clipped)
 }
 
-/// max( hub(y − V_c), hub(y − V) ) with V_c = V_old + clip(V − V_old, ± ε), element by element.
+/// max( hub(V_c − y), hub(V − y) ) with V_c = V_old + clip(V − V_old, ± ε), element by element.
 fn clipped_value_loss(values: &Tensor, old: &Tensor, targets: &Tensor, clip: f32, delta: f32) -> CandleResult<Tensor> {
-    let clipped = (old + ops::clamp(&(values - old)?, -clip, clip)?)?;
-    huber(&(targets - values)?, delta)?.maximum(&huber(&(targets - clipped)?, delta)?)
-}
-
-/// e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond, element by element (candle-nn's has the mean of them only). With m = min(|e|, δ)
-/// both are m (|e| − m/2), whose gradient has no term of the size of δ that would have to cancel.
-fn huber(error: &Tensor, delta: f32) -> CandleResult<Tensor> {
-    let size = error.abs()?;
-    let inner = ops::clamp(&size, 0.0, delta)?;
-    &inner * (size - (&inner * 0.5)?)?
+    let clipped = ops::plus(&ops::clamp(&ops::minus(values, old)?, -clip, clip)?, old)?;
+    let loss = |values: &Tensor| ops::huber(&ops::minus(values, targets)?, delta);
+    ops::maximum(&loss(values)?, &loss(&clipped)?)
 }
 
 fn gradients(networks: &[Network], variables: &[Vec<Var>], loss: &Tensor) -> Result<Gradients> {

@@ -11,7 +11,7 @@ use super::memory::Norm;
 use super::{Act, Chooser, Evaluated, Input, Layer, Network, Output, Policy, RELU_GAIN, Taken};
 use crate::distribution::ActionHeads;
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, Attention, action_log_probs, attention, constant, gelu, linear, with_values};
+use crate::ops::{Activation, Attention, action_log_probs, attention, constant, gelu, linear, row, with_values};
 use crate::params::{Init, ParamBuilder, ParamError};
 use cache::Cache;
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
@@ -276,7 +276,7 @@ impl Policy for Mat {
             Some(decoder) => decoder.forward(&encoded, &self.tokens(actions, input.agents)?)?,
         };
         let both = action_log_probs(&self.logits.forward(&features)?, actions.to_vec(), &self.heads)?;
-        Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: None })
+        Ok(Evaluated { log_probs: row(&both, 0)?, entropies: row(&both, 1)?, states: None })
     }
 }
 

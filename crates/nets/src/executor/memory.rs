@@ -1,7 +1,7 @@
 //! The memory of an executor: a gated recurrent unit with layer normalisation behind it.
 
 use super::{Input, Output};
-use crate::ops::{Activation, Chain, ChainBuilder, Gru, layer_norm};
+use crate::ops::{Activation, Before, Chain, ChainBuilder, Gru, layer_norm, recurrent};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -61,11 +61,12 @@ impl Memory {
     /// `x` is the input of the first layers, if they have one.
     pub(super) fn forward(&self, x: Option<&Tensor>, input: &Input<'_>) -> CandleResult<Output> {
         let sequences = input.sequences * input.agents;
-        let features = self.first.forward(x, input.features)?;
+        let rows = x.map(|x| self.first.forward(Some(x), input.features)).transpose()?;
+        let before = rows.as_ref().map_or(Before::Layers(&self.first), Before::Rows);
         // The state of a world's agents ends with its episode.
         let firsts = input.features.firsts.iter().flat_map(|first| std::iter::repeat_n(*first, input.agents)).collect();
-        let states = self.gru.forward(&features, input.hidden.clone(), firsts)?;
-        let flat = states.reshape((input.steps * sequences, self.width))?;
-        Ok(Output { out: self.head.forward(Some(&flat), input.features)?, states: Some(states) })
+        let parts = (before, &self.gru, &self.head);
+        let (out, states) = recurrent(parts, input.features, input.hidden.clone(), firsts)?;
+        Ok(Output { out, states: Some(states.reshape((input.steps, sequences, self.width))?) })
     }
 }

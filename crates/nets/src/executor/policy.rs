@@ -108,6 +108,6 @@ impl Policy for Independent {
             Some(_) => action_log_densities(&out, actions.moves.to_vec())?,
             None => action_log_probs(&out, actions.choices.to_vec(), &self.heads)?,
         };
-        Ok(Evaluated { log_probs: both.get(0)?, entropies: both.get(1)?, states: output.states })
+        Ok(Evaluated { log_probs: ops::row(&both, 0)?, entropies: ops::row(&both, 1)?, states: output.states })
     }
 }

@@ -95,7 +95,8 @@ impl QNetwork {
             Second::Memory(gru) => {
                 let rows = vectors.len() / width / steps;
                 let states = gru.forward(&first, memory, Vec::new())?;
-                (states.reshape((steps * rows, self.hidden))?, Some(states))
+                let steps = states.detach().reshape((steps, rows, self.hidden))?;
+                (states, Some(steps))
             }
         };
         Ok((self.head.forward(&features)?, states))

@@ -98,13 +98,6 @@ impl Layout {
     fn input_only(&self) -> bool {
         matches!(self.branches[..], [Branch::Input(_)])
     }
-
-    fn input(&self) -> Option<usize> {
-        self.branches.iter().find_map(|branch| match branch {
-            Branch::Input(width) => Some(*width),
-            _ => None,
-        })
-    }
 }
 
 /// Weights as the kernels want them; made once for all uses of a chain.
@@ -225,17 +218,25 @@ impl ChainBuilder {
 impl Chain {
     /// [R, n]. `input` is what the branch of that kind reads; R is its number of rows, or that of the features.
     pub fn forward(&self, input: Option<&Tensor>, features: &Arc<Features>) -> Result<Tensor> {
-        let keep = self.parameters.track_op() || input.is_some_and(Tensor::track_op);
-        let (layout, packs, features) = (self.layout.clone(), self.packs.clone(), features.clone());
-        let op = Op { layout, packs, features, keep, saved: OnceLock::new() };
+        let op = self.operation(features, input.is_some_and(Tensor::track_op));
         match input {
             None => apply1(op, &self.parameters),
             Some(input) => apply2(op, [input, &self.parameters]),
         }
     }
+
+    /// The operation of one use; `keep` says whether what it reads has a gradient.
+    pub(super) fn operation(&self, features: &Arc<Features>, keep: bool) -> Op {
+        let (layout, packs, features) = (self.layout.clone(), self.packs.clone(), features.clone());
+        Op { layout, packs, features, keep: keep || self.parameters.track_op(), saved: OnceLock::new() }
+    }
+
+    pub(super) fn parameters(&self) -> &Tensor {
+        &self.parameters
+    }
 }
 
-struct Op {
+pub(super) struct Op {
     layout: Arc<Layout>,
     packs: Arc<Packs>,
     features: Arc<Features>,
@@ -253,8 +254,7 @@ impl Operation<1> for Op {
     }
 
     fn backward(&self, [parameters]: [Arg<'_>; 1], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
-        let (gradient, _) = self.gradients(None, parameters.values, y, dy)?;
-        Ok([Some(gradient)])
+        Ok([Some(self.gradients((None, parameters.values), y, dy, &mut [])?)])
     }
 }
 
@@ -266,8 +266,9 @@ impl Operation<2> for Op {
     }
 
     fn backward(&self, [input, parameters]: [Arg<'_>; 2], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 2]> {
-        let (gradient, d_input) = self.gradients(Some(input), parameters.values, y, dy)?;
-        Ok([d_input, Some(gradient)])
+        let mut d_input = vec![0.0; input.values.len()];
+        let gradient = self.gradients((Some(input), parameters.values), y, dy, &mut d_input)?;
+        Ok([Some(d_input), Some(gradient)])
     }
 }
 

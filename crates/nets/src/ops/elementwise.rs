@@ -19,6 +19,12 @@ pub fn clamp(x: &Tensor, low: f32, high: f32) -> Result<Tensor> {
     apply1(Elementwise::Clamp(low, high), x)
 }
 
+/// Huber loss (Huber 1964): e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond (candle-nn's has the mean of them only). With m = min(|e|, δ)
+/// both are m (|e| − m/2), whose derivative is m with the sign of e.
+pub fn huber(error: &Tensor, delta: f32) -> Result<Tensor> {
+    apply1(Elementwise::Huber(delta), error)
+}
+
 /// Exponential linear unit: x above zero, eˣ − 1 elsewhere.
 pub fn elu(x: &Tensor) -> Result<Tensor> {
     apply1(Elementwise::Elu, x)
@@ -42,12 +48,20 @@ enum Elementwise {
     Tanh,
     Elu,
     Clamp(f32, f32),
+    Huber(f32),
 }
 
 impl Operation<1> for Elementwise {
     const NAME: &'static str = "elementwise";
 
     fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
+        if let Self::Huber(delta) = self {
+            let losses = x.values.iter().map(|e| {
+                let (size, inner) = (e.abs(), clamped(e.abs(), *delta));
+                inner * (size - inner * 0.5)
+            });
+            return Ok((losses.collect(), Shape::from(x.dims)));
+        }
         let mut y = vec![0.0; x.values.len()];
         let chunks = x.values.chunks(LANES).zip(y.chunks_mut(LANES));
         match self {
@@ -58,6 +72,7 @@ impl Operation<1> for Elementwise {
                 let (low, high) = (f32x16::splat(*low), f32x16::splat(*high));
                 chunks.for_each(|(x, y)| store(high.fast_min(low.fast_max(load(x))), y));
             }
+            Self::Huber(_) => {}
         }
         if matches!(self, Self::Elu) {
             y.iter_mut().zip(x.values).for_each(|(y, &x)| *y = if x > 0.0 { x } else { *y - 1.0 });
@@ -71,9 +86,19 @@ impl Operation<1> for Elementwise {
             Self::Exp => pairs.map(|(y, d)| d * y).collect(),
             Self::Tanh => pairs.map(|(y, d)| d * (1.0 - y * y)).collect(),
             Self::Elu => pairs.map(|(y, d)| d * if *y > 0.0 { 1.0 } else { y + 1.0 }).collect(),
+            Self::Huber(delta) => {
+                let errors = x.values.iter().zip(dy);
+                errors.map(|(e, d)| d * clamped(e.abs(), *delta).copysign(*e)).collect()
+            }
             Self::Clamp(..) => x.values.iter().zip(pairs).map(|(x, (y, d))| if x == y { *d } else { 0.0 }).collect(),
         })])
     }
+}
+
+/// min(x, high) that keeps what is no number.
+#[inline(always)]
+fn clamped(x: f32, high: f32) -> f32 {
+    if x > high { high } else { x }
 }
 
 struct Gelu;

@@ -129,9 +129,11 @@ macro_rules! tile {
         #[inline(always)]
         fn $name<const Q: usize>(x: Rows<'_>, dz: Rows<'_>, sums: &mut [f32], width: usize, rows: usize) {
             let mut acc = [[f32x16::ZERO; Q]; $inputs];
-            $(for q in 0..Q {
-                acc[$i][q] = load(&sums[$i * width + q * LANES..]);
-            })*
+            $(
+                for (acc, sums) in acc[$i].iter_mut().zip(sums[$i * width..][..Q * LANES].as_chunks().0) {
+                    *acc = f32x16::new(*sums);
+                }
+            )*
             for (x, dz) in x.values.chunks(x.stride).zip(dz.values.chunks(dz.stride)).take(rows) {
                 let (Some(x), Some(dz)) = (x.first_chunk::<$inputs>(), dz.as_chunks().0.first_chunk::<Q>()) else { break };
                 let dz = dz.map(f32x16::new);
@@ -142,9 +144,11 @@ macro_rules! tile {
                     }
                 )*
             }
-            $(for q in 0..Q {
-                store(acc[$i][q], &mut sums[$i * width + q * LANES..][..LANES]);
-            })*
+            $(
+                for (acc, sums) in acc[$i].iter().zip(sums[$i * width..][..Q * LANES].as_chunks_mut().0) {
+                    *sums = acc.to_array();
+                }
+            )*
         }
     };
 }

@@ -128,9 +128,9 @@ pub(crate) fn layer(
     rows: usize,
 ) {
     match act {
-        Activation::Identity => product(x, w, start, y, stride, rows, |z, _, _| z),
-        Activation::Relu => product(x, w, start, y, stride, rows, |z, _, _| Activation::Relu.apply(z)),
-        Activation::Tanh => product(x, w, start, y, stride, rows, |z, _, _| Activation::Tanh.apply(z)),
+        Activation::Identity => product(x, w, start, y, stride, rows, |z, _, _, _| z),
+        Activation::Relu => product(x, w, start, y, stride, rows, |z, _, _, _| Activation::Relu.apply(z)),
+        Activation::Tanh => product(x, w, start, y, stride, rows, |z, _, _, _| Activation::Tanh.apply(z)),
     }
 }
 
@@ -143,23 +143,19 @@ pub(crate) fn backward(
     stride: usize,
     rows: usize,
 ) {
-    let n = w.columns;
-    let at = |row: usize, column: usize| {
-        let from = row * x.stride + column;
-        load(&x.values[from..from + LANES.min(n - column)])
-    };
+    let at = |row: usize, column: usize, count: usize| load(&x.values[row * x.stride + column..][..count]);
     match act {
-        Activation::Identity => product(dz, w, Start::Zero, dx, stride, rows, |d, _, _| d),
+        Activation::Identity => product(dz, w, Start::Zero, dx, stride, rows, |d, _, _, _| d),
         Activation::Relu => {
-            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c| Activation::Relu.slope(at(r, c), d));
+            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c, n| Activation::Relu.slope(at(r, c, n), d));
         }
         Activation::Tanh => {
-            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c| Activation::Tanh.slope(at(r, c), d));
+            product(dz, w, Start::Zero, dx, stride, rows, |d, r, c, n| Activation::Tanh.slope(at(r, c, n), d));
         }
     }
 }
 
-/// `finish` gets a sum, its row and its first column.
+/// `finish` gets a sum, its row, its first column and how many columns there are.
 #[inline(always)]
 fn product(
     x: Rows<'_>,
@@ -168,7 +164,7 @@ fn product(
     y: &mut [f32],
     stride: usize,
     rows: usize,
-    finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+    finish: impl Fn(f32x16, usize, usize, usize) -> f32x16 + Copy,
 ) {
     let mut column = 0;
     for (q, panel) in &w.panels {
@@ -198,7 +194,7 @@ fn panel_rows<const Q: usize>(
     y: &mut [f32],
     place: Place,
     rows: usize,
-    finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+    finish: impl Fn(f32x16, usize, usize, usize) -> f32x16 + Copy,
 ) {
     let mut row = 0;
     let six = Q == 4 || !WIDE;
@@ -231,7 +227,7 @@ macro_rules! tile {
             y: &mut [f32],
             place: Place,
             row: usize,
-            finish: impl Fn(f32x16, usize, usize) -> f32x16 + Copy,
+            finish: impl Fn(f32x16, usize, usize, usize) -> f32x16 + Copy,
         ) {
             let Place { column, columns, stride } = place;
             let mut acc = [[f32x16::ZERO; Q]; $rows];
@@ -241,6 +237,12 @@ macro_rules! tile {
                     let bias: [f32x16; Q] =
                         std::array::from_fn(|q| load(&bias[(column + q * LANES).min(columns)..columns]));
                     acc = [bias; $rows];
+                }
+                Start::Output if column + Q * LANES <= columns => {
+                    $(
+                        let out = &y[(row + $r) * stride + column..][..Q * LANES];
+                        acc[$r].iter_mut().zip(out.as_chunks().0).for_each(|(acc, out)| *acc = f32x16::new(*out));
+                    )*
                 }
                 Start::Output => {
                     $(for q in 0..Q {
@@ -261,13 +263,23 @@ macro_rules! tile {
                     }
                 )*
             }
+            // Whole vectors need no look at where the columns end.
+            if column + Q * LANES <= columns {
+                $(
+                    let out = &mut y[(row + $r) * stride + column..][..Q * LANES];
+                    for (q, out) in out.as_chunks_mut().0.iter_mut().enumerate() {
+                        *out = finish(acc[$r][q], row + $r, column + q * LANES, LANES).to_array();
+                    }
+                )*
+                return;
+            }
             $(
                 let at = (row + $r) * stride;
                 for q in 0..Q {
                     let from = column + q * LANES;
                     if from < columns {
-                        let to = (from + LANES).min(columns);
-                        store(finish(acc[$r][q], row + $r, from), &mut y[at + from..at + to]);
+                        let count = LANES.min(columns - from);
+                        store(finish(acc[$r][q], row + $r, from, count), &mut y[at + from..at + from + count]);
                     }
                 }
             )*

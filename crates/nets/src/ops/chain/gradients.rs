@@ -13,20 +13,19 @@ use candle_core::{Result, bail};
 use std::ops::Range;
 
 impl Op {
-    /// Gradients of the parameters and of the input.
-    pub(super) fn gradients(
+    /// The gradient of the parameters; writes that of the input to `d_input`.
+    pub(in crate::ops) fn gradients(
         &self,
-        input: Option<Arg<'_>>,
-        p: &[f32],
+        (input, p): (Option<Arg<'_>>, &[f32]),
         y: &[f32],
         dy: &[f32],
-    ) -> Result<(Vec<f32>, Option<Vec<f32>>)> {
+        d_input: &mut [f32],
+    ) -> Result<Vec<f32>> {
         let (rows, widths, layout) = (self.rows(input)?, self.layout.widths(), &self.layout);
         let Some(saved) = self.saved.get() else { bail!("chain: gradient without forward") };
         let transposed = self.transposed(p);
         let mut sums =
             Sums::new(layout, self.packs(p), |states, width| self.sharing(rows, states(&self.features), width))?;
-        let mut d_input = layout.input().map(|width| vec![0.0; rows * width]);
         // Padded so that whole vectors can be read from any branch's first column on.
         let stride = widths.iter().max().map_or(0, |width| width.next_multiple_of(LANES) + LANES);
         let (mut d, mut below) = (Buffer::take(TILE * stride), Buffer::take(TILE * stride));
@@ -66,9 +65,9 @@ impl Op {
                 std::mem::swap(&mut d, &mut below);
             }
             let first = saved.first().map_or(y, |first| first);
-            self.branch_gradients(from..to, first, &mut d, stride, &mut sums, d_input.as_deref_mut());
+            self.branch_gradients(from..to, first, &mut d, stride, &mut sums, d_input);
         }
-        Ok((sums.write(layout, p.len(), &self.features)?, d_input))
+        sums.write(layout, p.len(), &self.features)
     }
 
     /// Takes in the gradient of the first rows of a tile.
@@ -79,7 +78,7 @@ impl Op {
         d: &mut [f32],
         stride: usize,
         sums: &mut Sums,
-        mut d_input: Option<&mut [f32]>,
+        d_input: &mut [f32],
     ) {
         let (rows, all) = (tile.len(), self.layout.first());
         let mut column = 0;
@@ -107,10 +106,8 @@ impl Op {
                     weights.backward(neighbours, counts, &d[column..], stride, gradient);
                 }
                 (Branch::Input(_), _) => {
-                    if let Some(d_input) = &mut d_input {
-                        let out = d_input[tile.start * width..tile.end * width].chunks_exact_mut(width);
-                        out.zip(d.chunks(stride)).for_each(|(out, d)| out.copy_from_slice(&d[column..column + width]));
-                    }
+                    let out = d_input[tile.start * width..tile.end * width].chunks_exact_mut(width);
+                    out.zip(d.chunks(stride)).for_each(|(out, d)| out.copy_from_slice(&d[column..column + width]));
                 }
                 _ => {}
             }
