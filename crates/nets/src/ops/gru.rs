@@ -2,7 +2,7 @@ use super::buffer::Buffer;
 use super::gradient::Gradient;
 use super::matmul::{Activation, Packed, Rows, Start, layer};
 use super::operation::{Arg, Operation, apply2};
-use super::simd::{LANES, load, sigmoid, store, tanh};
+use super::simd::{LANES, parts, parts_mut, sigmoid, tanh};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::ops::Range;
@@ -211,7 +211,13 @@ impl Operation<2> for Op {
 
 impl Op {
     /// The gradient of the parameters; writes that of the input to dx.
-    pub(super) fn gradients(&self, [x, p]: [Arg<'_>; 2], states: &[f32], dy: &[f32], dx: &mut [f32]) -> Result<Vec<f32>> {
+    pub(super) fn gradients(
+        &self,
+        [x, p]: [Arg<'_>; 2],
+        states: &[f32],
+        dy: &[f32],
+        dx: &mut [f32],
+    ) -> Result<Vec<f32>> {
         let (steps, rows) = self.steps_and_rows(&x)?;
         let (Sizes { inputs, hidden }, triple, [w_x, b_x, w_h, b_h]) =
             (self.sizes, self.sizes.triple(), self.sizes.ranges());
@@ -331,37 +337,34 @@ fn apart(width: usize) -> usize {
 /// One row of one step: x and u [3H] are the projections of input and state.
 #[inline(always)]
 fn gate(x: &[f32], u: &[f32], old: &[f32], state: &mut [f32], keep: &mut [f32]) {
-    let hidden = old.len();
-    for v in (0..hidden).step_by(LANES) {
-        let reset = sigmoid(load(&x[v..]) + load(&u[v..]));
-        let update = sigmoid(load(&x[hidden + v..]) + load(&u[hidden + v..]));
-        let candidate = load(&u[2 * hidden + v..]);
-        let new = tanh(reset.mul_add(candidate, load(&x[2 * hidden + v..])));
-        store(update.mul_add(load(&old[v..]) - new, new), &mut state[v..]);
-        store(reset, &mut keep[v..]);
-        store(update, &mut keep[hidden + v..]);
-        store(new, &mut keep[2 * hidden + v..]);
-        store(candidate, &mut keep[3 * hidden + v..]);
+    let n = old.len() / LANES;
+    let ([x_r, x_z, x_n], [u_r, u_z, u_n], [old]) = (parts(x, n), parts(u, n), parts(old, n));
+    let ([state], [k_r, k_z, k_n, k_c]) = (parts_mut(state, n), parts_mut(keep, n));
+    let of = f32x16::new;
+    for v in 0..n {
+        let reset = sigmoid(of(x_r[v]) + of(u_r[v]));
+        let update = sigmoid(of(x_z[v]) + of(u_z[v]));
+        let candidate = of(u_n[v]);
+        let new = tanh(reset.mul_add(candidate, of(x_n[v])));
+        state[v] = update.mul_add(of(old[v]) - new, new).to_array();
+        (k_r[v], k_z[v], k_n[v], k_c[v]) = (reset.to_array(), update.to_array(), new.to_array(), candidate.to_array());
     }
 }
 
 /// The way back. `dh` holds the gradient that comes from the next step, and then what goes straight to the step before.
 #[inline(always)]
 fn gate_gradients(keep: &[f32], old: &[f32], dy: &[f32], dh: &mut [f32], dx: &mut [f32], du: &mut [f32]) {
-    let (hidden, one) = (old.len(), f32x16::ONE);
-    for v in (0..hidden).step_by(LANES) {
-        let (reset, update) = (load(&keep[v..]), load(&keep[hidden + v..]));
-        let (new, candidate) = (load(&keep[2 * hidden + v..]), load(&keep[3 * hidden + v..]));
-        let d = load(&dh[v..]) + load(&dy[v..]);
+    let (n, one, of) = (old.len() / LANES, f32x16::ONE, f32x16::new);
+    let ([k_r, k_z, k_n, k_c], [old], [dy]) = (parts(keep, n), parts(old, n), parts(dy, n));
+    let ([dh], [dx_r, dx_z, dx_n], [du_r, du_z, du_n]) = (parts_mut(dh, n), parts_mut(dx, n), parts_mut(du, n));
+    for v in 0..n {
+        let (reset, update, new, candidate) = (of(k_r[v]), of(k_z[v]), of(k_n[v]), of(k_c[v]));
+        let d = of(dh[v]) + of(dy[v]);
         let d_new = d * (one - update) * (one - new * new);
-        let d_update = d * (load(&old[v..]) - new) * update * (one - update);
-        let d_reset = d_new * candidate * reset * (one - reset);
-        store(d_reset, &mut dx[v..]);
-        store(d_update, &mut dx[hidden + v..]);
-        store(d_new, &mut dx[2 * hidden + v..]);
-        store(d_reset, &mut du[v..]);
-        store(d_update, &mut du[hidden + v..]);
-        store(d_new * reset, &mut du[2 * hidden + v..]);
-        store(d * update, &mut dh[v..]);
+        let d_update = (d * (of(old[v]) - new) * update * (one - update)).to_array();
+        let d_reset = (d_new * candidate * reset * (one - reset)).to_array();
+        (dx_r[v], dx_z[v], dx_n[v]) = (d_reset, d_update, d_new.to_array());
+        (du_r[v], du_z[v], du_n[v]) = (d_reset, d_update, (d_new * reset).to_array());
+        dh[v] = (d * update).to_array();
     }
 }

@@ -23,12 +23,14 @@ pub(crate) fn normalise(x: &[f32], scale: &[f32], shift: &[f32], y: &mut [f32]) 
     let n = scale.len();
     for (row, out) in x.chunks_exact(n).zip(y.chunks_exact_mut(n)) {
         let (mean, inverse) = moments(row);
-        let inverse = f32x16::splat(inverse);
-        for i in (0..n).step_by(LANES) {
-            let to = n.min(i + LANES);
-            let normal = centred(&row[i..to], mean) * inverse;
-            store(normal.mul_add(load(&scale[i..to]), load(&shift[i..to])), &mut out[i..to]);
+        let (mean, inverse) = (f32x16::splat(mean), f32x16::splat(inverse));
+        let normal = |x: f32x16, scale: f32x16, shift: f32x16| ((x - mean) * inverse).mul_add(scale, shift);
+        let ((x, x_rest), (out, out_rest)) = (row.as_chunks::<LANES>(), out.as_chunks_mut::<LANES>());
+        let ((scale, scale_rest), (shift, shift_rest)) = (scale.as_chunks::<LANES>(), shift.as_chunks::<LANES>());
+        for ((x, out), (scale, shift)) in x.iter().zip(out).zip(scale.iter().zip(shift)) {
+            *out = normal(f32x16::new(*x), f32x16::new(*scale), f32x16::new(*shift)).to_array();
         }
+        store(normal(load(x_rest), load(scale_rest), load(shift_rest)), out_rest);
     }
 }
 
@@ -41,14 +43,15 @@ const EPSILON: f32 = 1e-5;
 fn moments(row: &[f32]) -> (f32, f32) {
     let n = row.len() as f32;
     let (mut total, mut square) = (f32x16::ZERO, f32x16::ZERO);
-    for chunk in row.chunks(LANES) {
-        total += load(chunk);
-    }
-    let mean = sum(total) / n;
-    for chunk in row.chunks(LANES) {
-        let gap = centred(chunk, mean);
+    let (whole, rest) = row.as_chunks::<LANES>();
+    whole.iter().for_each(|chunk| total += f32x16::new(*chunk));
+    let mean = sum(total + load(rest)) / n;
+    for chunk in whole {
+        let gap = f32x16::new(*chunk) - f32x16::splat(mean);
         square = gap.mul_add(gap, square);
     }
+    let gap = centred(rest, mean);
+    square = gap.mul_add(gap, square);
     (mean, 1.0 / (sum(square) / n + EPSILON).sqrt())
 }
 

@@ -51,8 +51,28 @@ impl Operation<2> for Pairs {
         let pairs = a.values.iter().zip(b.values);
         let y = match self {
             // A comparison with NaN is false; then the sum is NaN, too.
-            Self::Minimum => pairs.map(|(&a, &b)| if a < b { a } else if b <= a { b } else { a + b }).collect(),
-            Self::Maximum => pairs.map(|(&a, &b)| if a > b { a } else if b >= a { b } else { a + b }).collect(),
+            Self::Minimum => pairs
+                .map(|(&a, &b)| {
+                    if a < b {
+                        a
+                    } else if b <= a {
+                        b
+                    } else {
+                        a + b
+                    }
+                })
+                .collect(),
+            Self::Maximum => pairs
+                .map(|(&a, &b)| {
+                    if a > b {
+                        a
+                    } else if b >= a {
+                        b
+                    } else {
+                        a + b
+                    }
+                })
+                .collect(),
             Self::Plus => pairs.map(|(a, b)| a + b).collect(),
             Self::Minus => pairs.map(|(a, b)| a - b).collect(),
             Self::Times => pairs.map(|(a, b)| a * b).collect(),
@@ -64,7 +84,17 @@ impl Operation<2> for Pairs {
         // Half a gradient for each of two equal numbers.
         let part = |own: &[f32], other: &[f32]| {
             let triples = own.iter().zip(other).zip(y.iter().zip(dy));
-            triples.map(|((o, other), (y, d))| if o != y { 0.0 } else if other == y { 0.5 * d } else { *d }).collect()
+            triples
+                .map(|((o, other), (y, d))| {
+                    if o != y {
+                        0.0
+                    } else if other == y {
+                        0.5 * d
+                    } else {
+                        *d
+                    }
+                })
+                .collect()
         };
         Ok(match self {
             Self::Minimum | Self::Maximum => [Some(part(a.values, b.values)), Some(part(b.values, a.values))],

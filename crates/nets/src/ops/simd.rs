@@ -51,6 +51,24 @@ pub(crate) fn store(value: f32x16, slice: &mut [f32]) {
     }
 }
 
+/// Whole vectors of a row, `H / 16` of each of its parts.
+#[inline(always)]
+pub(crate) fn parts<const P: usize>(row: &[f32], vectors: usize) -> [&[[f32; LANES]]; P] {
+    let all = row.as_chunks().0;
+    std::array::from_fn(|p| &all[p * vectors..][..vectors])
+}
+
+/// The same to write to.
+#[inline(always)]
+pub(crate) fn parts_mut<const P: usize>(row: &mut [f32], vectors: usize) -> [&mut [[f32; LANES]]; P] {
+    let mut left = row.as_chunks_mut().0;
+    std::array::from_fn(|_| {
+        let (part, rest) = std::mem::take(&mut left).split_at_mut(vectors);
+        left = rest;
+        part
+    })
+}
+
 /// Sum of the lanes in a fixed order (a balanced tree), the same on every instruction set.
 #[inline(always)]
 pub(crate) fn sum(value: f32x16) -> f32 {

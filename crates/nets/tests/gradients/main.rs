@@ -103,7 +103,10 @@ fn recurrent_unit() {
     let rows = Tensor::cat(&[x.narrow(0, 3, 1).unwrap(), x.narrow(0, 6, 1).unwrap()], 0).unwrap();
     let own = unit(&p).forward(&rows, vec![0.0; 16], Vec::new()).unwrap();
     let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    assert_eq!(numbers(&whole.reshape((4, 3, 16)).unwrap().narrow(0, 1, 2).unwrap().narrow(1, 0, 1).unwrap()), numbers(&own));
+    assert_eq!(
+        numbers(&whole.reshape((4, 3, 16)).unwrap().narrow(0, 1, 2).unwrap().narrow(1, 0, 1).unwrap()),
+        numbers(&own)
+    );
     assert!(unit(&p).forward(&x, vec![0.0; 17], Vec::new()).is_err());
     assert!(unit(&p).forward(&x, vec![0.0; 5 * 16], Vec::new()).is_err());
 }

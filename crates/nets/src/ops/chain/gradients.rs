@@ -11,6 +11,7 @@ use crate::ops::pool::{PoolGradient, PoolWeights};
 use crate::ops::simd::{LANES, load, store};
 use candle_core::{Result, bail};
 use std::ops::Range;
+use wide::f32x16;
 
 impl Op {
     /// The gradient of the parameters; writes that of the input to `d_input`.
@@ -129,10 +130,11 @@ pub(in crate::ops) fn slopes(act: Activation, y: &[f32], dy: &[f32], n: usize, d
 /// d · f'(z) of one row.
 #[inline(always)]
 fn slope_in_place(act: Activation, y: &[f32], d: &mut [f32]) {
-    for (y, d) in y.chunks(LANES).zip(d.chunks_mut(LANES)) {
-        let d = &mut d[..y.len()];
-        store(act.slope(load(y), load(d)), d);
+    let ((y, y_rest), (d, d_rest)) = (y.as_chunks::<LANES>(), d[..y.len()].as_chunks_mut::<LANES>());
+    for (y, d) in y.iter().zip(d) {
+        *d = act.slope(f32x16::new(*y), f32x16::new(*d)).to_array();
     }
+    store(act.slope(load(y_rest), load(d_rest)), d_rest);
 }
 
 /// Gradients of all parameters while rows pass.
