@@ -75,11 +75,9 @@ pub struct ActorReport {
 pub(crate) type UnacknowledgedResults = BTreeMap<u64, EncodedResult>;
 
 /// Reads the learner's first message, with the time after which a silent actor loses its leases.
-pub(crate) async fn welcome(
-    inbound: &mut Streaming<v1::RolloutResponse>,
-) -> Result<(v1::Welcome, Duration), SessionEnd> {
+pub(crate) async fn welcome(reply: &mut Streaming<v1::RolloutResponse>) -> Result<(v1::Welcome, Duration), SessionEnd> {
     let message =
-        inbound.message().await?.ok_or_else(|| SessionEnd::Broken("the learner closed the connection".to_owned()))?;
+        reply.message().await?.ok_or_else(|| SessionEnd::Broken("the learner closed the connection".to_owned()))?;
     let welcome = match message.message {
         Some(Response::Welcome(welcome)) => welcome,
         Some(Response::Drain(drain)) if drain.finished => return Err(SessionEnd::Finished),

@@ -9,6 +9,7 @@ use crate::error::{to_status, too_late};
 use crate::metrics::CommanderMetrics;
 use crate::model_store::ModelStore;
 use crate::scheduler::{AssignmentMethod, Scheduler, TeamReply};
+use magex_assign::GoOn;
 use magex_dispatch::answer::Planned;
 use magex_dispatch::{AssignError, Limits, Problem, engine};
 use magex_proto::apart::apart;
@@ -97,14 +98,14 @@ impl AssignService {
             true => (self.small_for_model(problem, &budget), engine::learned_cells(problem)),
             false => (small, problem.memory()),
         };
-        let should_continue = || !budget.over();
+        let go_on = || !budget.over();
         let planned = if here {
-            self.plan_here(problem, budget.learned(), &should_continue)
+            self.plan_here(problem, budget.learned(), &go_on)
         } else {
             match self.places(cells, budget.left()).await {
                 Ok(places) => return self.plan_on_thread(problem, budget, places).await,
                 Err(_) if learned && small => {
-                    solve(problem, "all processors are busy, so the model was not called".to_owned(), &should_continue)
+                    solve(problem, "all processors are busy, so the model was not called".to_owned(), &go_on)
                 }
                 Err(busy) => return Err(busy),
             }
@@ -123,8 +124,7 @@ impl AssignService {
         let (places, mut reason) = (Arc::new(places), String::new());
         if problem.scheduler == AssignmentMethod::Learned {
             let (own, problem, limit) = (self.clone(), problem.clone(), budget.learned());
-            let asking =
-                on_thread(places.clone(), budget, move |work| own.ask_learned(&problem, &|| work.should_continue()));
+            let asking = on_thread(places.clone(), budget, move |work| own.ask_learned(&problem, &|| work.go_on()));
             match tokio::time::timeout(limit, asking).await {
                 Ok(Ok(Ok(planned))) => return Ok(planned),
                 Ok(Ok(Err(why))) => reason = why,
@@ -133,7 +133,7 @@ impl AssignService {
             }
         }
         let problem = problem.clone();
-        let solving = on_thread(places, budget, move |work| solve(&problem, reason, &|| work.should_continue()));
+        let solving = on_thread(places, budget, move |work| solve(&problem, reason, &|| work.go_on()));
         let solved = tokio::time::timeout_at((budget.until + LATE).into(), solving).await;
         solved.map_err(|_| too_late())??.map_err(to_status)
     }
@@ -166,26 +166,21 @@ impl AssignService {
     }
 
     /// Answers on this thread. The answer of a learned scheduler that exceeded `limit` is dropped.
-    pub(crate) fn plan_here(
-        &self,
-        problem: &Problem,
-        limit: Duration,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Planned, AssignError> {
+    pub(crate) fn plan_here(&self, problem: &Problem, time: Duration, go_on: GoOn<'_>) -> Result<Planned, AssignError> {
         let mut reason = String::new();
         if problem.scheduler == AssignmentMethod::Learned {
             let start = Instant::now();
-            match self.ask_learned(problem, should_continue) {
-                Ok(planned) if start.elapsed() <= limit => return Ok(planned),
-                Ok(_) => reason = exceeded(limit),
+            match self.ask_learned(problem, go_on) {
+                Ok(planned) if start.elapsed() <= time => return Ok(planned),
+                Ok(_) => reason = exceeded(time),
                 Err(why) => reason = why,
             }
         }
-        solve(problem, reason, should_continue)
+        solve(problem, reason, go_on)
     }
 
     /// The learned answer, or the reason for a fallback.
-    fn ask_learned(&self, problem: &Problem, should_continue: &dyn Fn() -> bool) -> Result<Planned, String> {
+    fn ask_learned(&self, problem: &Problem, go_on: GoOn<'_>) -> Result<Planned, String> {
         if let Some(reason) = engine::not_for_learned(problem) {
             return Err(reason.to_owned());
         }
@@ -193,7 +188,7 @@ impl AssignService {
             return Err("no model is loaded".to_owned());
         };
         // The call may have ended before a thread was free.
-        if !should_continue() {
+        if !go_on() {
             return Err("the deadline passed before the model was called".to_owned());
         }
         let start = Instant::now();
@@ -206,10 +201,10 @@ impl AssignService {
         }
         let reply = reply?;
         // The rest is work only for a call that still waits.
-        if !should_continue() {
+        if !go_on() {
             return Err("the model answered after the deadline".to_owned());
         }
-        let plan = engine::adopt(problem, reply.goals, reply.probabilities, should_continue)?;
+        let plan = engine::adopt(problem, reply.goals, reply.probabilities, go_on)?;
         let weights = (key.version.0, key.sha256.clone(), key.run_id.0.clone());
         Ok(Planned { plan, fallback_reason: String::new(), weights: Some(weights) })
     }
@@ -225,12 +220,8 @@ fn bytes(team: &v1::AssignRequest) -> usize {
 const MODEL_FAILED: &str = "the model failed with an internal error";
 
 /// Solves by the requested method; the exact one answers in place of the learned one, for `fallback_reason`.
-fn solve(
-    problem: &Problem,
-    fallback_reason: String,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Planned, AssignError> {
-    let plan = engine::solve(problem, problem.scheduler, should_continue)?;
+fn solve(problem: &Problem, fallback_reason: String, go_on: GoOn<'_>) -> Result<Planned, AssignError> {
+    let plan = engine::solve(problem, problem.scheduler, go_on)?;
     Ok(Planned { plan, fallback_reason, weights: None })
 }
 

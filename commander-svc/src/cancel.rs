@@ -30,7 +30,7 @@ pub(crate) struct Work {
 
 impl Work {
     /// The call waits and its deadline has not passed.
-    pub(crate) fn should_continue(&self) -> bool {
+    pub(crate) fn go_on(&self) -> bool {
         !self.cancelled.is_cancelled() && !self.budget.over()
     }
 }

@@ -254,7 +254,7 @@ impl MissionService {
     }
 
     fn planner(&self, work: &Work) -> impl Fn(&Problem) -> Result<Planned, AssignError> {
-        move |problem| self.answering.plan_here(problem, work.budget.learned(), &|| work.should_continue())
+        move |problem| self.answering.plan_here(problem, work.budget.learned(), &|| work.go_on())
     }
 
     /// A mission that this caller may change.
@@ -292,7 +292,7 @@ impl MissionService {
 
 /// Before something is written: a call that was answered with an error has changed nothing.
 fn check(work: &Work) -> Result<(), Status> {
-    if work.should_continue() { Ok(()) } else { Err(to_status(AssignError::Interrupted)) }
+    if work.go_on() { Ok(()) } else { Err(to_status(AssignError::Interrupted)) }
 }
 
 fn learned(scheduler: i32) -> bool {

@@ -2,7 +2,7 @@
 
 use crate::scheduler::{AssignmentMethod, GoalReply, GoalRequest, Scheduler, SchedulerError, TeamReply};
 use crate::shard_goals::answer;
-use magex_assign::UNASSIGNED;
+use magex_assign::{GoOn, UNASSIGNED};
 use magex_core::config::{CommanderPolicy, RunConfig};
 use magex_core::rng::{Key, Purpose};
 use magex_dispatch::Problem;
@@ -41,18 +41,12 @@ pub fn load_scheduler(weights: &[u8], run_config_toml: &str) -> Result<Arc<dyn S
 }
 
 impl Scheduler for RunScheduler {
-    fn assign_batch(
-        &self,
-        request: &GoalRequest,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<GoalReply, SchedulerError> {
-        answer(&self.commander, self.random_assignment_fraction, request, should_continue).map_err(
-            |error| match error {
-                CommanderError::Instance(problem) => SchedulerError::Invalid(ConvertError::new("agents", problem)),
-                CommanderError::Interrupted => SchedulerError::Interrupted,
-                other => SchedulerError::Compute(other.to_string()),
-            },
-        )
+    fn assign_batch(&self, request: &GoalRequest, go_on: GoOn<'_>) -> Result<GoalReply, SchedulerError> {
+        answer(&self.commander, self.random_assignment_fraction, request, go_on).map_err(|error| match error {
+            CommanderError::Instance(problem) => SchedulerError::Invalid(ConvertError::new("agents", problem)),
+            CommanderError::Interrupted => SchedulerError::Interrupted,
+            other => SchedulerError::Compute(other.to_string()),
+        })
     }
 
     fn method(&self) -> AssignmentMethod {

@@ -1,5 +1,6 @@
 //! The interface to the scheduler of a run.
 
+use magex_assign::GoOn;
 use magex_dispatch::Problem;
 use magex_policy::acting::Policies;
 use magex_proto::convert::ConvertError;
@@ -37,12 +38,8 @@ pub enum SchedulerError {
 
 /// The scheduler of a run with one version of its weights. Answers are pure functions of the request.
 pub trait Scheduler: Send + Sync {
-    /// Goals for the episodes of a shard, for as long as `should_continue` holds; random choices are keyed by (seed, shard).
-    fn assign_batch(
-        &self,
-        request: &GoalRequest,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<GoalReply, SchedulerError>;
+    /// Goals for the episodes of a shard, for as long as `go_on` holds; random choices are keyed by (seed, shard).
+    fn assign_batch(&self, request: &GoalRequest, go_on: GoOn<'_>) -> Result<GoalReply, SchedulerError>;
 
     /// The method that the run configures. Only a learned scheduler answers single teams.
     fn method(&self) -> AssignmentMethod {

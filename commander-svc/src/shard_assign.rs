@@ -69,7 +69,7 @@ impl ShardAssign {
         let Ok(Some(places)) = tokio::time::timeout(QUEUE_TIMEOUT.min(budget.left()), places).await else {
             return Err(status::resource_exhausted("all threads are busy with other shards", Duration::from_secs(1)));
         };
-        let solve = move |work: &Work| scheduler.assign_batch(&request, &|| work.should_continue());
+        let solve = move |work: &Work| scheduler.assign_batch(&request, &|| work.go_on());
         Ok((on_thread(places, budget, solve).await?.map_err(to_status)?, method))
     }
 }

@@ -1,19 +1,19 @@
 //! The goals of one shard: a pure function of the request and the weights.
 
 use magex_assign::random::random;
-use magex_assign::{cost_of_points, exact_points};
+use magex_assign::{GoOn, cost_of_points, exact_points};
 use magex_core::keys::{episode_keys, random_goals};
 use magex_nets::commander::{Commander, CommanderError, Team};
 use magex_proto::goals::{GoalReply, GoalRequest};
 
 /// Assigns the goals of every stage of every episode of a shard. Random choices are keyed by (seed, shard, episode).
 /// `random_assignment_fraction` of the training episodes get a random matching, whatever the scheduler.
-/// `should_continue` is called before every team.
+/// `go_on` is called before every team.
 pub fn answer(
     commander: &Commander,
     random_assignment_fraction: f32,
     request: &GoalRequest,
-    should_continue: &dyn Fn() -> bool,
+    go_on: GoOn<'_>,
 ) -> Result<GoalReply, CommanderError> {
     let (n, g, d, k) = (request.agent_count, request.goal_count, request.dims, request.stages);
     let b = request.shard.episodes as usize;
@@ -34,7 +34,7 @@ pub fn answer(
         let mut stream = episode_keys(request.seed, &request.shard, e as u32).commander.stream();
         let mut shuffled = random_goals(request.seed, &request.shard, e as u32, random_assignment_fraction);
         for stage in e * k..(e + 1) * k {
-            if !should_continue() {
+            if !go_on() {
                 return Err(CommanderError::Interrupted);
             }
             let team = Team {

@@ -393,13 +393,10 @@ pub fn configuration(run: &Path) -> Option<String> {
 
 /// The newest checkpoint that can be read, and what was wrong with the newer ones. One of another format is not damage: what
 /// it holds is not given up for an older one.
-pub fn read_latest(
-    run: &Path,
-    template: &Learned,
-) -> Result<(Progress, Learned, Vec<CheckpointError>), CheckpointError> {
+pub fn read_latest(run: &Path, like: &Learned) -> Result<(Progress, Learned, Vec<CheckpointError>), CheckpointError> {
     let mut skipped = Vec::new();
     for folder in list(run).iter().rev() {
-        match read(folder, template) {
+        match read(folder, like) {
             Ok((progress, learned)) => return Ok((progress, learned, skipped)),
             Err(error @ CheckpointError::Format { .. }) => return Err(error),
             Err(error) => skipped.push(error),

@@ -3,7 +3,7 @@
 //! Binary search over the sorted costs with Hopcroft & Karp's maximum matching (1973) on the pairs up to the threshold;
 //! among the assignments with the smallest largest cost, the one with the smallest sum.
 
-use crate::{AssignError, Assignment, Solver, Switching, UNASSIGNED, check_allowed, pairs};
+use crate::{AssignError, Assignment, GoOn, Result, Solver, Switching, UNASSIGNED, check_allowed, pairs};
 
 const NONE: u32 = u32::MAX;
 
@@ -20,7 +20,7 @@ impl BottleneckSolver {
     /// As many pairs of `cost`, row-major `[rows, cols]`, as possible where +∞ forbids a pair; among those the smallest largest
     /// cost, then the smallest sum, then the lowest matching. Costs of d^p make the sum one of d^p among the same smallest
     /// largest distances. Where some pairs are in force, a pair of a row that leaves its column costs the switching cost more;
-    /// the number of rows that do comes after the sum. Stops as soon as `should_continue` returns false.
+    /// the number of rows that do comes after the sum. Stops as soon as `go_on` returns false.
     /// Fails as [`Solver::solve_switching`].
     pub fn solve_switching(
         &mut self,
@@ -28,26 +28,26 @@ impl BottleneckSolver {
         rows: usize,
         cols: usize,
         switching: &Switching<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Assignment, AssignError> {
+        go_on: GoOn<'_>,
+    ) -> Result<Assignment> {
         check_allowed(cost, rows, cols)?;
         switching.check(rows, cols)?;
         let Self { solver, matcher, values } = self;
         let costs = Costs { cost, rows, cols };
         let found = if pairs(switching.current).next().is_none() || switching.cost == 0.0 {
-            costs.search(matcher, values, |place| cost[place], should_continue)?
+            costs.search(matcher, values, |place| cost[place], go_on)?
         } else {
             let key = |place: usize| {
                 let (row, col) = (place / cols, place % cols);
                 let leaves = switching.current[row] != UNASSIGNED && !switching.holds(row, col);
                 exact_sum(cost[place], if leaves { switching.cost } else { 0.0 })
             };
-            costs.search(matcher, values, key, should_continue)?
+            costs.search(matcher, values, key, go_on)?
         };
         if !found {
             return Ok(Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 });
         }
-        solver.solve_switching(values, rows, cols, switching, should_continue)
+        solver.solve_switching(values, rows, cols, switching, go_on)
     }
 }
 
@@ -73,8 +73,8 @@ impl Costs<'_> {
         matcher: &mut Matcher,
         values: &mut Vec<f64>,
         key: impl Fn(usize) -> K,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<bool, AssignError> {
+        go_on: GoOn<'_>,
+    ) -> Result<bool> {
         let &Self { cost, rows, cols } = self;
         let allowed = |place: &usize| cost[*place] < f64::INFINITY;
         let order = |a: &K, b: &K| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal);
@@ -86,14 +86,14 @@ impl Costs<'_> {
         let up_to = |limit: K| move |place: usize| cost[place] < f64::INFINITY && key(place) <= limit;
         let pairs = match keys.len() == cost.len() {
             true => rows.min(cols),
-            false => matcher.run(rows, cols, |place| cost[place] < f64::INFINITY, should_continue)?,
+            false => matcher.run(rows, cols, |place| cost[place] < f64::INFINITY, go_on)?,
         };
         keys.sort_unstable_by(order);
         keys.dedup();
         let (mut low, mut high) = (0, keys.len() - 1);
         while low < high {
             let middle = low + (high - low) / 2;
-            if matcher.run(rows, cols, up_to(keys[middle]), should_continue)? == pairs {
+            if matcher.run(rows, cols, up_to(keys[middle]), go_on)? == pairs {
                 high = middle;
             } else {
                 low = middle + 1;
@@ -122,15 +122,15 @@ pub(crate) struct Matcher {
 }
 
 impl Matcher {
-    /// Size of the largest matching of allowed places of a matrix `[rows, cols]`. `should_continue` is called before every round of paths of the same length.
+    /// Size of the largest matching of allowed places of a matrix `[rows, cols]`. `go_on` is called before every round of paths of the same length.
     pub(crate) fn run(
         &mut self,
         rows: usize,
         cols: usize,
         allowed: impl Fn(usize) -> bool,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<usize, AssignError> {
-        if !should_continue() {
+        go_on: GoOn<'_>,
+    ) -> Result<usize> {
+        if !go_on() {
             return Err(AssignError::Interrupted);
         }
         self.edges.clear();
@@ -146,7 +146,7 @@ impl Matcher {
         self.row_of_col.resize(cols, NONE);
         let mut matched = 0;
         while self.layers(rows) {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             self.cursor.clear();

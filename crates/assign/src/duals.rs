@@ -10,7 +10,7 @@
 //! The bits of the answer do not depend on the machine: sums run in sixteen fixed lanes, multiply-adds are explicit,
 //! and the exponential and the logarithm are polynomials of this file.
 
-use crate::{AssignError, check_size, invalid_entry};
+use crate::{Result, check_size, invalid_entry};
 use wide::f32x16;
 
 const LANES: usize = 16;
@@ -52,7 +52,7 @@ impl Duals {
 /// Sinkhorn potentials of `cost`, row-major `[rows, cols]`, in the units of the cost. Row sums are 1 and column sums
 /// rows / cols. A problem whose mean |cost| is 0 has potentials 0.
 /// Fails for mismatched shapes, and entries that are not finite or beyond 1e30.
-pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize) -> Result<Duals, AssignError> {
+pub fn sinkhorn_duals(cost: &[f32], rows: usize, cols: usize) -> Result<Duals> {
     check_size(cost.len(), rows, cols)?;
     if let Some(place) = cost.iter().position(|value| value.is_nan() || value.abs() > 1e30) {
         return Err(invalid_entry(place, cols, f64::from(cost[place])));

@@ -13,7 +13,7 @@ mod scan;
 mod shortlist;
 
 use crate::ties::{self, Graph, Memory, NONE, Solution};
-use crate::{AssignError, Assignment, Switching, UNASSIGNED, check_costs, cost_of};
+use crate::{AssignError, Assignment, GoOn, Result, Switching, UNASSIGNED, check_costs, cost_of};
 use problem::Matrix;
 use scan::{LANES, find, higher, least, lower, nearest_column, nearly_tight, relax, two_least};
 use shortlist::{Shortlists, WORTH_IT};
@@ -65,21 +65,15 @@ impl Solver {
     /// The assignment of min(rows, cols) pairs with the smallest summed cost, the lowest one of several; `cost` is row-major
     /// `[rows, cols]`.
     /// Fails for mismatched shapes, and at the first entry that is NaN, infinite or beyond 1e300.
-    pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+    pub fn solve(&mut self, cost: &[f64], rows: usize, cols: usize) -> Result<Assignment> {
         check_costs(cost, rows, cols)?;
         self.solve_matrix(&Matrix::new(cost, rows, cols), &|| true)
     }
 
     /// The same where a cost of +∞ forbids a pair: as many pairs as possible, and among those the smallest summed cost.
-    /// Stops as soon as `should_continue` returns false; it is called once per shortest-path search.
-    pub fn solve_allowed(
-        &mut self,
-        cost: &[f64],
-        rows: usize,
-        cols: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Assignment, AssignError> {
-        self.solve_switching(cost, rows, cols, &Switching::default(), should_continue)
+    /// Stops as soon as `go_on` returns false; it is called once per shortest-path search.
+    pub fn solve_allowed(&mut self, cost: &[f64], rows: usize, cols: usize, go_on: GoOn<'_>) -> Result<Assignment> {
+        self.solve_switching(cost, rows, cols, &Switching::default(), go_on)
     }
 
     /// The same where some pairs are in force: minimises summed cost + switching cost × rows that leave their column, then the
@@ -91,22 +85,17 @@ impl Solver {
         rows: usize,
         cols: usize,
         switching: &Switching<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Assignment, AssignError> {
-        self.solve_matrix(&Matrix::check(cost, rows, cols, switching)?, should_continue)
+        go_on: GoOn<'_>,
+    ) -> Result<Assignment> {
+        self.solve_matrix(&Matrix::check(cost, rows, cols, switching)?, go_on)
     }
 
     /// Dual prices of the rows of a cost matrix `[n, n]`.
-    pub(crate) fn row_prices(
-        &mut self,
-        cost: &[f64],
-        n: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Vec<f64>, AssignError> {
+    pub(crate) fn row_prices(&mut self, cost: &[f64], n: usize, go_on: GoOn<'_>) -> Result<Vec<f64>> {
         let mut own = std::mem::take(&mut self.cost);
         self.stride = n.next_multiple_of(LANES);
         Matrix::new(cost, n, n).load(&mut own, self.stride);
-        let solved = self.run(&own, n, n, should_continue);
+        let solved = self.run(&own, n, n, go_on);
         self.cost = own;
         solved?;
         let price = |(row, &col): (usize, &u32)| cost[row * n + col as usize] - self.price[col as usize];
@@ -114,11 +103,7 @@ impl Solver {
     }
 
     /// Solves what was checked.
-    fn solve_matrix(
-        &mut self,
-        matrix: &Matrix<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Assignment, AssignError> {
+    fn solve_matrix(&mut self, matrix: &Matrix<'_>, go_on: GoOn<'_>) -> Result<Assignment> {
         let &Matrix { cost, rows, cols, .. } = matrix;
         let wide = rows <= cols;
         let mut own = std::mem::take(&mut self.cost);
@@ -129,8 +114,8 @@ impl Solver {
             matrix.load(&mut own, self.stride);
         }
         let used = if as_it_is { cost } else { &own };
-        let solved = self.run(used, rows.min(cols), rows.max(cols), should_continue);
-        let settled = solved.and_then(|()| self.settle(used, matrix, should_continue));
+        let solved = self.run(used, rows.min(cols), rows.max(cols), go_on);
+        let settled = solved.and_then(|()| self.settle(used, matrix, go_on));
         self.cost = own;
         settled?;
         let mut col_of_row: Vec<u32> = if wide {
@@ -151,12 +136,7 @@ impl Solver {
     }
 
     /// Makes the matching that was found the exact one, and the lowest of several.
-    fn settle(
-        &mut self,
-        cost: &[f64],
-        matrix: &Matrix<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn settle(&mut self, cost: &[f64], matrix: &Matrix<'_>, go_on: GoOn<'_>) -> Result<()> {
         let (rows, cols) = (matrix.rows.min(matrix.cols), matrix.rows.max(matrix.cols));
         let Self { stride, price, row_price, row_of_col, col_of_row, near, memory, .. } = self;
         let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
@@ -183,16 +163,10 @@ impl Solver {
         }
         let row_of_col = &mut row_of_col[..cols];
         let mut solution = Solution { row_price, col_price: &price[..cols], col_of_row, row_of_col };
-        ties::settle(near, tolerance, &mut solution, matrix, memory, should_continue)
+        ties::settle(near, tolerance, &mut solution, matrix, memory, go_on)
     }
 
-    fn run(
-        &mut self,
-        cost: &[f64],
-        rows: usize,
-        cols: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn run(&mut self, cost: &[f64], rows: usize, cols: usize, go_on: GoOn<'_>) -> Result<()> {
         let stride = self.stride;
         refill(&mut self.price, stride, 0.0);
         refill(&mut self.row_of_col, stride, NONE);
@@ -212,7 +186,7 @@ impl Solver {
             self.shortlists.reset(rows);
         }
         for next in 0..self.free.len() {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             self.augment(cost, cols, self.free[next]);

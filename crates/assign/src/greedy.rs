@@ -1,18 +1,13 @@
 //! Greedy assignment: the globally cheapest pair first.
 
-use crate::{AssignError, Assignment, UNASSIGNED, check_allowed, cost_of};
+use crate::{AssignError, Assignment, GoOn, Result, UNASSIGNED, check_allowed, cost_of};
 
 /// Pairs that are sorted at once.
 const CHUNK: usize = 1 << 16;
 
 /// Takes the cheapest remaining pair of `cost` `[rows, cols]` until one side is used up; ties go to the lowest (row, column),
-/// and +∞ forbids a pair. Stops as soon as `should_continue` returns false. Fails as [`crate::Solver::solve_allowed`].
-pub fn greedy(
-    cost: &[f64],
-    rows: usize,
-    cols: usize,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+/// and +∞ forbids a pair. Stops as soon as `go_on` returns false. Fails as [`crate::Solver::solve_allowed`].
+pub fn greedy(cost: &[f64], rows: usize, cols: usize, go_on: GoOn<'_>) -> Result<Assignment> {
     check_allowed(cost, rows, cols)?;
     let allowed = cost.iter().enumerate().filter(|&(_, &value)| value < f64::INFINITY);
     let mut order: Vec<(u64, u64)> = allowed.map(|(place, &value)| (ascending(value), place as u64)).collect();
@@ -26,7 +21,7 @@ pub fn greedy(
             break;
         }
         // A small problem is solved faster than a cancellation would be noticed.
-        if order.len() > CHUNK && !should_continue() {
+        if order.len() > CHUNK && !go_on() {
             return Err(AssignError::Interrupted);
         }
         if end - start > CHUNK {

@@ -54,6 +54,12 @@ pub use points::{
 pub use sparse::{AllowedPairs, PointProblem, bottleneck_points, exact_points, solve_pairs, solve_points};
 pub use switching::Switching;
 
+/// An answer, or why there is none.
+pub type Result<T> = std::result::Result<T, AssignError>;
+
+/// Whether to go on, asked now and then by whatever may take long; `false` ends it with [`AssignError::Interrupted`].
+pub type GoOn<'a> = &'a dyn Fn() -> bool;
+
 /// Stands in [`Assignment::col_of_row`] for a row without a partner (only when there are more rows than columns).
 pub const UNASSIGNED: u32 = u32::MAX;
 
@@ -116,7 +122,7 @@ pub fn compensated_sum(terms: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Checks shape and entries of a cost matrix `[rows, cols]`.
-fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<(), AssignError> {
+fn check_costs(cost: &[f64], rows: usize, cols: usize) -> Result<()> {
     check_size(cost.len(), rows, cols)?;
     // Counting instead of searching vectorises.
     if cost.iter().filter(|&&value| !usable(value)).count() == 0 {
@@ -150,7 +156,7 @@ impl Span {
 }
 
 /// Checks shape and entries of a cost matrix `[rows, cols]` in which +∞ forbids a pair.
-pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Span, AssignError> {
+pub(crate) fn check_allowed(cost: &[f64], rows: usize, cols: usize) -> Result<Span> {
     check_size(cost.len(), rows, cols)?;
     let mut span = Span { forbidden: 0, least: f64::INFINITY, largest: f64::NEG_INFINITY };
     for (block, values) in cost.chunks(BLOCK).enumerate() {
@@ -197,7 +203,7 @@ fn invalid_entry(place: usize, cols: usize, value: f64) -> AssignError {
     AssignError::invalid(format!("cost[{row}][{col}]"), format!("{value} is not a finite number up to 1e300"))
 }
 
-fn check_shape(rows: usize, cols: usize) -> Result<(), AssignError> {
+fn check_shape(rows: usize, cols: usize) -> Result<()> {
     let problem = match (rows.min(cols), rows.max(cols)) {
         (0, _) => "is empty; both must be at least 1",
         (_, 0x8000_0000..) => "is too large; both must be below 2^31",
@@ -207,7 +213,7 @@ fn check_shape(rows: usize, cols: usize) -> Result<(), AssignError> {
 }
 
 /// Checks a shape and the number of its entries.
-fn check_size(found: usize, rows: usize, cols: usize) -> Result<(), AssignError> {
+fn check_size(found: usize, rows: usize, cols: usize) -> Result<()> {
     check_shape(rows, cols)?;
     // A product that overflows cannot be the length of anything, so saturating is enough to refuse it.
     let expected = rows.saturating_mul(cols);

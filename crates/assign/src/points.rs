@@ -1,6 +1,6 @@
 //! Distances between points, and powers of them.
 
-use crate::{AssignError, check_shape, invalid_size};
+use crate::{AssignError, Result, check_shape, invalid_size};
 
 /// Largest magnitude of a coordinate: squares of differences stay finite.
 pub const LARGEST_COORDINATE: f64 = 1e100;
@@ -54,11 +54,7 @@ pub fn cost_of_points<T: Copy + Into<f64>>(agents: &[T], goals: &[T], dims: usiz
 
 /// Checks agents `[rows, dims]` and goals `[cols, dims]`: neither empty nor ragged, every coordinate finite and up to
 /// [`LARGEST_COORDINATE`]. Returns (rows, cols).
-pub(crate) fn check_points<T: Copy + Into<f64>>(
-    agents: &[T],
-    goals: &[T],
-    dims: usize,
-) -> Result<(usize, usize), AssignError> {
+pub(crate) fn check_points<T: Copy + Into<f64>>(agents: &[T], goals: &[T], dims: usize) -> Result<(usize, usize)> {
     if dims == 0 {
         return Err(AssignError::invalid("dims", "0 is out of range; use at least 1"));
     }
@@ -79,7 +75,7 @@ pub(crate) fn check_points<T: Copy + Into<f64>>(
     Ok((rows, cols))
 }
 
-pub(crate) fn check_power(power: f64) -> Result<(), AssignError> {
+pub(crate) fn check_power(power: f64) -> Result<()> {
     if POWERS.contains(&power) {
         return Ok(());
     }
@@ -93,7 +89,7 @@ pub fn distances_into<T: Copy + Into<f64>>(
     goals: &[T],
     dims: usize,
     cost: &mut Vec<f64>,
-) -> Result<(usize, usize), AssignError> {
+) -> Result<(usize, usize)> {
     costs_into(agents, goals, dims, 1.0, cost)
 }
 
@@ -105,7 +101,7 @@ pub fn costs_into<T: Copy + Into<f64>>(
     dims: usize,
     power: f64,
     cost: &mut Vec<f64>,
-) -> Result<(usize, usize), AssignError> {
+) -> Result<(usize, usize)> {
     check_power(power)?;
     let (rows, cols) = check_points(agents, goals, dims)?;
     cost.clear();

@@ -21,8 +21,8 @@ mod start;
 mod threshold;
 mod tree;
 
-use crate::AssignError;
 use crate::ties::{self, Exact, Graph, NONE, Solution};
+use crate::{AssignError, GoOn, Result};
 use candidates::{Candidates, Engine};
 
 pub use pairs::{AllowedPairs, solve_pairs};
@@ -41,15 +41,10 @@ struct Order {
 
 /// Solves by auction and shortest paths: `[rows]` the column of each row, the number of columns + the row where it has none, in
 /// the numbers of the problem, as in `exact`. No more rows than columns.
-fn solve<C: Candidates>(
-    source: C,
-    order: &Order,
-    exact: &impl Exact,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Vec<u32>, AssignError> {
+fn solve<C: Candidates>(source: C, order: &Order, exact: &impl Exact, go_on: GoOn<'_>) -> Result<Vec<u32>> {
     let rows = source.rows();
     let mut engine = Engine::new(source);
-    engine.run(should_continue)?;
+    engine.run(go_on)?;
     let mut state = State::of(&engine, order);
     let magnitude = |prices: &[f64]| prices.iter().fold(0.0f64, |largest, price| largest.max(price.abs()));
     let mut tolerance = ties::tolerance(rows, magnitude(&state.row_price), magnitude(&state.col_price));
@@ -57,7 +52,7 @@ fn solve<C: Candidates>(
         let mut beaten = 0.0;
         state.near.clear();
         for row in 0..rows {
-            if row % 1024 == 0 && !should_continue() {
+            if row % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             beaten += state.collect(&mut engine, order, row, tolerance);
@@ -77,7 +72,7 @@ fn solve<C: Candidates>(
         col_of_row: &mut col_of_row,
         row_of_col: &mut row_of_col,
     };
-    ties::settle(&near, tolerance, &mut solution, exact, &mut ties::Memory::default(), should_continue)?;
+    ties::settle(&near, tolerance, &mut solution, exact, &mut ties::Memory::default(), go_on)?;
     Ok(col_of_row)
 }
 

@@ -3,12 +3,9 @@
 /// Of a node that was not met, or is in no component yet.
 const NONE: u32 = u32::MAX;
 
-/// The component of every node, and the nodes of every component (Tarjan 1972, with a stack of its own). `out` gives the target of
+/// The component of every node, and the nodes of every component (Tarjan 1972, with a stack of its own). `to` gives the target of
 /// the k-th arc of a node: `Some(None)` for an arc that does not count, `None` behind the last one.
-pub(crate) fn strongly_connected(
-    nodes: usize,
-    out: impl Fn(u32, usize) -> Option<Option<u32>>,
-) -> (Vec<u32>, Vec<u32>) {
+pub(crate) fn strongly_connected(nodes: usize, to: impl Fn(u32, usize) -> Option<Option<u32>>) -> (Vec<u32>, Vec<u32>) {
     // Order in which nodes were met, and the first one met of those that can be reached back.
     let (mut of, mut met, mut low) = (vec![NONE; nodes], vec![NONE; nodes], vec![0u32; nodes]);
     let (mut size, mut open, mut path, mut count) = (Vec::new(), Vec::new(), Vec::new(), 0);
@@ -24,7 +21,7 @@ pub(crate) fn strongly_connected(
                 count += 1;
                 open.push(node);
             }
-            if let Some(target) = out(node, *next) {
+            if let Some(target) = to(node, *next) {
                 *next += 1;
                 let Some(target) = target else { continue };
                 if met[target as usize] == NONE {

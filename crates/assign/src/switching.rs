@@ -1,6 +1,6 @@
 //! Pairs that are in force, and what leaving them costs.
 
-use crate::{AssignError, LARGEST_COST, UNASSIGNED};
+use crate::{AssignError, LARGEST_COST, Result, UNASSIGNED};
 
 /// Current pairs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -17,7 +17,7 @@ impl Switching<'_> {
         self.current.get(row).is_some_and(|&current| current as usize == col)
     }
 
-    pub(crate) fn check(&self, rows: usize, cols: usize) -> Result<(), AssignError> {
+    pub(crate) fn check(&self, rows: usize, cols: usize) -> Result<()> {
         if !(0.0..=LARGEST_COST).contains(&self.cost) {
             let problem = format!("{} is not a number from 0 to {LARGEST_COST:e}", self.cost);
             return Err(AssignError::invalid("switching_cost", problem));

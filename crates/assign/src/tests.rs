@@ -1,3 +1,4 @@
+use crate::Result;
 use crate::duals::sinkhorn_duals;
 use crate::*;
 use magex_core::rng::{Key, Purpose, Stream};
@@ -16,13 +17,13 @@ fn uniform_points(n: usize, index: u32) -> (Vec<f32>, Vec<f32>) {
     (points(), points())
 }
 
-fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>, AssignError> {
+fn distances(agents: &[f32], goals: &[f32], dims: usize) -> Result<Vec<f64>> {
     let mut cost = Vec::new();
     distances_into(agents, goals, dims, &mut cost)?;
     Ok(cost)
 }
 
-fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment, AssignError> {
+fn exact(cost: &[f64], rows: usize, cols: usize) -> Result<Assignment> {
     Solver::default().solve(cost, rows, cols)
 }
 

@@ -16,7 +16,7 @@ mod components;
 mod lowest;
 mod repair;
 
-use crate::AssignError;
+use crate::{GoOn, Result};
 use components::Components;
 
 /// Nearly tight pairs per row above which a look for cycles would be longer than what follows.
@@ -100,13 +100,13 @@ pub(crate) fn settle(
     solution: &mut Solution<'_>,
     exact: &impl Exact,
     memory: &mut Memory,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<(), AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<()> {
     let spare_columns = solution.col_price.len() > near.rows();
     if near.cols.len() > MANY * near.rows() {
         // Costs of a few values: as a rule all these pairs are exactly tight, and there is nothing to take apart.
         if let Some(spare) = repair::tight_already(near, &|_| spare_columns, solution, exact) {
-            return lowest::lowest(near, &spare, solution, exact, should_continue);
+            return lowest::lowest(near, &spare, solution, exact, go_on);
         }
     } else if components::has_no_cycle(near, tolerance, solution, memory) {
         // Most problems end here.
@@ -115,6 +115,6 @@ pub(crate) fn settle(
     let pooled = components::pooled(tolerance, solution);
     let parts = Components::of(near, solution.row_of_col, &pooled);
     let tied = parts.inner(near);
-    let tight = repair::repair(&tied, &parts, solution, exact, should_continue)?;
-    lowest::lowest(&tight.graph, &tight.spare, solution, exact, should_continue)
+    let tight = repair::repair(&tied, &parts, solution, exact, go_on)?;
+    lowest::lowest(&tight.graph, &tight.spare, solution, exact, go_on)
 }

@@ -12,8 +12,8 @@ use crate::lists::{LARGE_CELLS, Listed};
 use crate::problem::Problem;
 use magex_assign::random::random_allowed;
 use magex_assign::{
-    AllowedPairs, AssignError, BottleneckSolver, PointProblem, Solver, Switching, bottleneck_points, compensated_sum,
-    greedy, pairs, solve_pairs, solve_points,
+    AllowedPairs, AssignError, BottleneckSolver, GoOn, PointProblem, Solver, Switching, bottleneck_points,
+    compensated_sum, greedy, pairs, solve_pairs, solve_points,
 };
 use magex_core::rng::{Key, Purpose};
 use magex_proto::goals::AssignmentMethod;
@@ -72,25 +72,21 @@ fn with_workspace<T>(problem: &Problem, work: impl FnOnce(&mut Workspace) -> T) 
     })
 }
 
-/// Solves by a method; the exact one answers in place of the learned one. `should_continue` is called from time to time.
+/// Solves by a method; the exact one answers in place of the learned one. `go_on` is called from time to time.
 /// When that returns false, the answer is [`AssignError::Interrupted`].
-pub fn solve(
-    problem: &Problem,
-    kind: AssignmentMethod,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Plan, AssignError> {
+pub fn solve(problem: &Problem, kind: AssignmentMethod, go_on: GoOn<'_>) -> Result<Plan, AssignError> {
     if problem.cells() == 0 {
         return Ok(nothing(problem, kind));
     }
     if problem.cells() > LARGE_CELLS {
         let exact = matches!(kind, AssignmentMethod::Exact | AssignmentMethod::Learned);
         if exact && let Some(listed) = problem.listed() {
-            return solve_listed(problem, &listed, should_continue);
+            return solve_listed(problem, &listed, go_on);
         }
         if (exact || kind == AssignmentMethod::Makespan)
             && let Some(costs) = problem.without_matrix()
         {
-            return solve_large(problem, kind, &costs, should_continue);
+            return solve_large(problem, kind, &costs, go_on);
         }
     }
     with_workspace(problem, |workspace| {
@@ -102,13 +98,13 @@ pub fn solve(
         let (place_of, scheduler) = match kind {
             AssignmentMethod::Exact | AssignmentMethod::Learned => {
                 let Workspace { solver, costs, .. } = workspace;
-                let answer = solver.solve_switching(costs, rows, cols, &switching, should_continue)?;
+                let answer = solver.solve_switching(costs, rows, cols, &switching, go_on)?;
                 (answer.col_of_row, AssignmentMethod::Exact)
             }
             AssignmentMethod::Makespan if problem.terms.weighted() => {
                 let Workspace { solver, makespan, costs, unweighted, .. } = workspace;
                 problem.unweighted_into(unweighted);
-                let first = makespan.solve_switching(unweighted, rows, cols, &switching, should_continue)?;
+                let first = makespan.solve_switching(unweighted, rows, cols, &switching, go_on)?;
                 let leaves = |row: usize, col: usize| {
                     let left = current.get(row).is_some_and(|&own| own != UNASSIGNED && own as usize != col);
                     if left { problem.switching_cost } else { 0.0 }
@@ -120,25 +116,25 @@ pub fn solve(
                         *cost = f64::INFINITY;
                     }
                 }
-                (solver.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
+                (solver.solve_switching(costs, rows, cols, &switching, go_on)?.col_of_row, kind)
             }
             AssignmentMethod::Makespan => {
                 let Workspace { makespan, costs, .. } = workspace;
-                (makespan.solve_switching(costs, rows, cols, &switching, should_continue)?.col_of_row, kind)
+                (makespan.solve_switching(costs, rows, cols, &switching, go_on)?.col_of_row, kind)
             }
             AssignmentMethod::Greedy => {
                 let adjusted = workspace.adjust(problem);
                 let target = if adjusted { &workspace.adjusted } else { &workspace.costs };
-                (greedy(target, rows, cols, should_continue)?.col_of_row, kind)
+                (greedy(target, rows, cols, go_on)?.col_of_row, kind)
             }
             AssignmentMethod::Random => {
                 let mut stream = Key::new(problem.seed, Purpose::Request, &[]).stream();
-                (random_allowed(&workspace.costs, rows, cols, &mut stream, should_continue)?, kind)
+                (random_allowed(&workspace.costs, rows, cols, &mut stream, go_on)?, kind)
             }
         };
         let proven = scheduler == AssignmentMethod::Exact && !sticky;
         let plan = Plan { goal_of: goals_of(problem, place_of), scheduler, ..Plan::default() };
-        workspace.finish(problem, plan, proven, should_continue)
+        workspace.finish(problem, plan, proven, go_on)
     })
 }
 
@@ -152,15 +148,15 @@ fn solve_large(
     problem: &Problem,
     kind: AssignmentMethod,
     costs: &[(u32, u32, f64)],
-    should_continue: &dyn Fn() -> bool,
+    go_on: GoOn<'_>,
 ) -> Result<Plan, AssignError> {
     let Problem { agents, goals, dims, .. } = problem;
     let switching = Switching { current: &problem.current, cost: problem.switching_cost };
     let own = PointProblem { power: problem.terms.power, costs, ..PointProblem::new(agents, goals, *dims) };
     let with_current = PointProblem { switching, ..own };
     let (answer, scheduler) = match kind {
-        AssignmentMethod::Makespan => (bottleneck_points(&with_current, should_continue)?, kind),
-        _ => (solve_points(&with_current, should_continue)?, AssignmentMethod::Exact),
+        AssignmentMethod::Makespan => (bottleneck_points(&with_current, go_on)?, kind),
+        _ => (solve_points(&with_current, go_on)?, AssignmentMethod::Exact),
     };
     let proven = scheduler == AssignmentMethod::Exact && !sticky(problem);
     let pairs_of = answer.pairs().count();
@@ -170,7 +166,7 @@ fn solve_large(
     if proven {
         plan.exact_cost = Some(plan.cost);
     } else if problem.cells() <= GAP_CELLS {
-        match solve_points(&own, should_continue) {
+        match solve_points(&own, go_on) {
             Ok(exact) if exact.pairs().count() == pairs_of => {
                 plan.exact_cost = Some(total(&problem.pair_terms(&exact.col_of_row), 0.0));
             }
@@ -185,11 +181,11 @@ fn solve_large(
 }
 
 /// Solves a large team of listed pairs exactly, without a matrix.
-fn solve_listed(problem: &Problem, listed: &Listed, should_continue: &dyn Fn() -> bool) -> Result<Plan, AssignError> {
+fn solve_listed(problem: &Problem, listed: &Listed, go_on: GoOn<'_>) -> Result<Plan, AssignError> {
     let (rows, cols) = (problem.agent_count, problem.goal_count);
     let switching = Switching { current: &problem.current, cost: problem.switching_cost };
     let own = AllowedPairs { rows, cols, pairs: &listed.pairs, switching: Switching::default() };
-    let answer = solve_pairs(&AllowedPairs { switching, ..own }, should_continue)?;
+    let answer = solve_pairs(&AllowedPairs { switching, ..own }, go_on)?;
     let pairs_of = answer.pairs().count();
     let cost_of = |goal_of: &[u32], pairs: &[PairTerms]| total(pairs, unserved(problem, listed.unserved, goal_of));
     let mut plan = Plan { goal_of: answer.col_of_row, scheduler: AssignmentMethod::Exact, ..Plan::default() };
@@ -199,7 +195,7 @@ fn solve_listed(problem: &Problem, listed: &Listed, should_continue: &dyn Fn() -
     if !sticky(problem) {
         plan.exact_cost = Some(plan.cost);
     } else if problem.cells() <= GAP_CELLS {
-        match solve_pairs(&own, should_continue) {
+        match solve_pairs(&own, go_on) {
             Ok(exact) if exact.pairs().count() == pairs_of => {
                 plan.exact_cost = Some(cost_of(&exact.col_of_row, &problem.pair_terms(&exact.col_of_row)));
             }
@@ -225,7 +221,7 @@ pub fn adopt(
     problem: &Problem,
     goals: Vec<Option<u32>>,
     probabilities: Option<Vec<f32>>,
-    should_continue: &dyn Fn() -> bool,
+    go_on: GoOn<'_>,
 ) -> Result<Plan, String> {
     check(problem, &goals, probabilities.as_deref())?;
     let wish: Vec<u32> = goals.into_iter().map(|goal| goal.unwrap_or(UNASSIGNED)).collect();
@@ -236,7 +232,7 @@ pub fn adopt(
         if let Some((agent, goal)) = pairs(&wish).find(|(agent, goal)| costs[agent * cols + goal] == f64::INFINITY) {
             return Err(format!("the model assigned the forbidden pair of agent {agent} and goal {goal}"));
         }
-        let planned = workspace.follow(problem, &wish, probabilities, should_continue);
+        let planned = workspace.follow(problem, &wish, probabilities, go_on);
         planned.map_err(|error| error.to_string())
     })
 }
@@ -270,19 +266,19 @@ impl Workspace {
         problem: &Problem,
         wish: &[u32],
         probabilities: Option<Vec<f32>>,
-        should_continue: &dyn Fn() -> bool,
+        go_on: GoOn<'_>,
     ) -> Result<Plan, AssignError> {
         let goal_of = match self.adjust(problem) {
             true => {
                 let Self { solver, adjusted, .. } = self;
-                sticky::follow(wish, adjusted, problem.goal_count, &problem.current, solver, should_continue)?
+                sticky::follow(wish, adjusted, problem.goal_count, &problem.current, solver, go_on)?
             }
             false => wish.to_vec(),
         };
         let own = |(agent, p): (usize, f32)| (goal_of[agent] == wish[agent]).then_some(p);
         let probabilities = probabilities.map(|all| all.into_iter().enumerate().map(own).collect());
         let scheduler = AssignmentMethod::Learned;
-        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, false, should_continue)
+        self.finish(problem, Plan { goal_of, probabilities, scheduler, ..Plan::default() }, false, go_on)
     }
 
     /// Fills the adjusted costs if there are current pairs.
@@ -303,7 +299,7 @@ impl Workspace {
         problem: &Problem,
         mut plan: Plan,
         proven: bool,
-        should_continue: &dyn Fn() -> bool,
+        go_on: GoOn<'_>,
     ) -> Result<Plan, AssignError> {
         let (rows, cols) = (problem.agent_count, problem.place_count());
         let Self { solver, costs, .. } = self;
@@ -314,7 +310,7 @@ impl Workspace {
         if proven {
             plan.exact_cost = Some(plan.cost);
         } else if rows * cols <= GAP_CELLS {
-            match solver.solve_allowed(costs, rows, cols, should_continue) {
+            match solver.solve_allowed(costs, rows, cols, go_on) {
                 Ok(exact) if exact.pairs().count() == pairs(&plan.goal_of).count() => {
                     let goal_of = goals_of(problem, exact.col_of_row);
                     let cost = total(&problem.pair_terms(&goal_of), unserved(problem, longest, &goal_of));

@@ -14,14 +14,7 @@ impl Moments {
 
     /// One update by Adam. The gradient is scaled down to `max_norm` if its L2 norm over all parameters, summed in order, is
     /// larger. Returns the norm before clipping; a gradient that is not finite changes nothing and returns its norm.
-    pub fn adam_step(
-        &mut self,
-        parameters: &mut [f32],
-        gradient: &[f32],
-        rate: f64,
-        epsilon: f64,
-        max_norm: f64,
-    ) -> f64 {
+    pub fn adam_step(&mut self, values: &mut [f32], gradient: &[f32], rate: f64, epsilon: f64, max_norm: f64) -> f64 {
         let norm = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt();
         if !norm.is_finite() {
             return norm;
@@ -33,7 +26,7 @@ impl Moments {
         let rate = (rate / unbias1) as f32;
         let (b1, b2) = (BETA1 as f32, BETA2 as f32);
         let (root, epsilon) = ((1.0 / unbias2.sqrt()) as f32, epsilon as f32);
-        for (((p, &g), m), v) in parameters.iter_mut().zip(gradient).zip(&mut self.first).zip(&mut self.second) {
+        for (((p, &g), m), v) in values.iter_mut().zip(gradient).zip(&mut self.first).zip(&mut self.second) {
             let g = g * scale;
             *m = b1 * *m + (1.0 - b1) * g;
             *v = b2 * *v + (1.0 - b2) * g * g;

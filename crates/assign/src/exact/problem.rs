@@ -1,7 +1,7 @@
 //! A cost matrix with forbidden and current pairs, as the solver and as exact arithmetic see it.
 
 use crate::ties::Exact;
-use crate::{AssignError, Switching, UNASSIGNED, check_allowed};
+use crate::{Result, Switching, UNASSIGNED, check_allowed};
 
 /// Costs `[rows, cols]` that were checked.
 pub(super) struct Matrix<'a> {
@@ -19,12 +19,7 @@ impl<'a> Matrix<'a> {
         Self { cost, rows, cols, penalty: None, switching: Switching::default() }
     }
 
-    pub(super) fn check(
-        cost: &'a [f64],
-        rows: usize,
-        cols: usize,
-        switching: &Switching<'a>,
-    ) -> Result<Self, AssignError> {
+    pub(super) fn check(cost: &'a [f64], rows: usize, cols: usize, switching: &Switching<'a>) -> Result<Self> {
         let mut span = check_allowed(cost, rows, cols)?;
         switching.check(rows, cols)?;
         let matrix = Self { penalty: None, switching: *switching, ..Self::new(cost, rows, cols) };

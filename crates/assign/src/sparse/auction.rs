@@ -2,7 +2,7 @@
 
 use super::NONE;
 use super::candidates::{COUNT, Candidates, Engine};
-use crate::AssignError;
+use crate::{AssignError, GoOn, Result};
 
 /// Stages, from [`NEAR`] mean differences between the cheapest and the second cheapest column on; ε falls by [`FALL`] from one
 /// to the next.
@@ -21,33 +21,33 @@ const FEW: usize = 8;
 impl<C: Candidates> Engine<C> {
     /// Gives most rows a column that is one of their cheapest. With as many rows as columns, stages of falling ε; otherwise a
     /// column must keep the price 0 until it is taken, and once taken it never becomes free again: one stage without ε.
-    pub(super) fn auction(&mut self, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    pub(super) fn auction(&mut self, go_on: GoOn<'_>) -> Result<()> {
         let rows = self.col_of_row.len();
         let mut free: Vec<u32> = (0..rows as u32).collect();
         if rows == self.row_of_col.len() && rows > 1 {
-            self.guess(should_continue)?;
-            self.stages(STAGES, should_continue)?;
+            self.guess(go_on)?;
+            self.stages(STAGES, go_on)?;
             free.clear();
-            self.free_unless_best(&mut free, 0.0, should_continue)?;
+            self.free_unless_best(&mut free, 0.0, go_on)?;
         }
-        self.bid(&mut free, 0.0, 4 * rows, usize::MAX, should_continue)
+        self.bid(&mut free, 0.0, 4 * rows, usize::MAX, go_on)
     }
 
     /// Stages of falling ε; returns the last one. Rows that a stage leaves over do not bid in the next ones.
-    pub(super) fn stages(&mut self, stages: usize, should_continue: &dyn Fn() -> bool) -> Result<f64, AssignError> {
+    pub(super) fn stages(&mut self, stages: usize, go_on: GoOn<'_>) -> Result<f64> {
         let rows = self.col_of_row.len();
         let chain = SHORTEST_CHAIN.max(rows / CHAIN);
         let mut free: Vec<u32> = (0..rows as u32).collect();
-        let mut epsilon = self.first_epsilon(should_continue)?;
+        let mut epsilon = self.first_epsilon(go_on)?;
         self.count = FEW;
         for stage in 0..stages {
             if stage > 0 {
                 epsilon *= FALL;
                 free.clear();
-                self.free_unless_best(&mut free, epsilon, should_continue)?;
+                self.free_unless_best(&mut free, epsilon, go_on)?;
             }
             let (bids, looks) = (self.bids, self.looks);
-            self.bid(&mut free, epsilon, BIDS * rows, chain, should_continue)?;
+            self.bid(&mut free, epsilon, BIDS * rows, chain, go_on)?;
             self.count = if 2 * (self.looks - looks) > self.bids - bids { FEW } else { COUNT };
         }
         self.count = COUNT;
@@ -55,11 +55,11 @@ impl<C: Candidates> Engine<C> {
     }
 
     /// ε of the first stage.
-    fn first_epsilon(&mut self, should_continue: &dyn Fn() -> bool) -> Result<f64, AssignError> {
+    fn first_epsilon(&mut self, go_on: GoOn<'_>) -> Result<f64> {
         let rows = self.col_of_row.len();
         let mut sum = 0.0;
         for row in 0..rows as u32 {
-            if row % 1024 == 0 && !should_continue() {
+            if row % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             let best = self.best(row);
@@ -71,14 +71,9 @@ impl<C: Candidates> Engine<C> {
     }
 
     /// Frees the rows whose column is not within ε of their cheapest.
-    fn free_unless_best(
-        &mut self,
-        free: &mut Vec<u32>,
-        epsilon: f64,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn free_unless_best(&mut self, free: &mut Vec<u32>, epsilon: f64, go_on: GoOn<'_>) -> Result<()> {
         for row in 0..self.col_of_row.len() as u32 {
-            if row % 1024 == 0 && !should_continue() {
+            if row % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             let col = self.col_of_row[row as usize];
@@ -93,24 +88,17 @@ impl<C: Candidates> Engine<C> {
 
     /// Every free row takes its cheapest column at a price that makes the second cheapest one better by ε, and the row that had
     /// it is next, up to `chain` times. Rows that are left are `free` afterwards.
-    fn bid(
-        &mut self,
-        free: &mut Vec<u32>,
-        epsilon: f64,
-        mut budget: usize,
-        chain: usize,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn bid(&mut self, free: &mut Vec<u32>, epsilon: f64, mut most: usize, chain: usize, go_on: GoOn<'_>) -> Result<()> {
         let mut left = Vec::new();
         for first in std::mem::take(free) {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             let mut row = first;
             let mut chain = chain;
             loop {
                 self.bids += 1;
-                if self.bids.is_multiple_of(256) && !should_continue() {
+                if self.bids.is_multiple_of(256) && !go_on() {
                     return Err(AssignError::Interrupted);
                 }
                 let best = self.best(row);
@@ -132,8 +120,8 @@ impl<C: Candidates> Engine<C> {
                     break;
                 }
                 self.col_of_row[displaced as usize] = NONE;
-                (budget, chain) = (budget.saturating_sub(1), chain.saturating_sub(1));
-                if !progress || budget == 0 || chain == 0 {
+                (most, chain) = (most.saturating_sub(1), chain.saturating_sub(1));
+                if !progress || most == 0 || chain == 0 {
                     left.push(displaced);
                     break;
                 }

@@ -2,7 +2,7 @@
 
 use super::NONE;
 use super::tree::Found;
-use crate::AssignError;
+use crate::{GoOn, Result};
 
 /// Candidates that are looked up at once, as a rule.
 pub(super) const COUNT: usize = 16;
@@ -35,13 +35,7 @@ pub(super) trait Candidates {
         Self: Sized;
     /// Sets all prices: to the largest at which no row of the sample would have a column cheaper than its `[rows]` least
     /// cost − price.
-    fn spread(
-        &mut self,
-        sample: &Self,
-        least: &[f64],
-        price: &mut Vec<f64>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError>;
+    fn spread(&mut self, sample: &Self, least: &[f64], price: &mut Vec<f64>, go_on: GoOn<'_>) -> Result<()>;
 }
 
 /// The cheapest columns of a row when they were looked up.
@@ -101,9 +95,9 @@ impl<C: Candidates> Engine<C> {
     }
 
     /// Finds a cheapest matching of all rows, as far as doubles can tell, and its prices.
-    pub(super) fn run(&mut self, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
-        self.auction(should_continue)?;
-        self.search(0.0, should_continue)
+    pub(super) fn run(&mut self, go_on: GoOn<'_>) -> Result<()> {
+        self.auction(go_on)?;
+        self.search(0.0, go_on)
     }
 
     pub(super) fn cols(&self) -> usize {

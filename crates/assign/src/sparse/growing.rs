@@ -4,7 +4,7 @@ use super::Order;
 use super::costs::{Metric, OwnCost, OwnCosts};
 use super::points::Limit;
 use super::tree::Tree;
-use crate::AssignError;
+use crate::{GoOn, Result};
 
 /// A largest matching of pairs up to a threshold, which changes.
 pub(super) trait Growing<const D: usize> {
@@ -14,14 +14,14 @@ pub(super) trait Growing<const D: usize> {
     /// Whether the rows are that side.
     fn rows_are_shorter(&self) -> bool;
     /// Makes the matching a largest one of pairs up to the limit; returns its size.
-    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError>;
+    fn grow(&mut self, limit: f64, go_on: GoOn<'_>) -> Result<usize>;
     /// Rows that the last round has reached in vain.
     fn reached(&mut self) -> &mut Vec<u32>;
     /// The dearest pair.
     fn largest(&mut self) -> f64;
 
     /// The smallest largest cost.
-    fn search(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Limit>, AssignError> {
+    fn search(&mut self, go_on: GoOn<'_>) -> Result<Option<Limit>> {
         let (rows, whole) = (self.seeker().from.len(), self.whole());
         // The dearest of the rows' cheapest pairs is a lower bound if all rows need one, the cheapest otherwise.
         let (mut low, mut least) = (f64::NEG_INFINITY, f64::INFINITY);
@@ -41,7 +41,7 @@ pub(super) trait Growing<const D: usize> {
         let target = if self.seeker().own.is_empty() && complete {
             whole
         } else {
-            let pairs = self.grow(f64::INFINITY, should_continue)?;
+            let pairs = self.grow(f64::INFINITY, go_on)?;
             if pairs < whole {
                 // Some rows stay without a column: their cheapest pairs say nothing.
                 low = f64::NEG_INFINITY;
@@ -56,7 +56,7 @@ pub(super) trait Growing<const D: usize> {
         let mut high = f64::INFINITY;
         let mut limit = low;
         while low < high {
-            if self.grow(limit, should_continue)? == target {
+            if self.grow(limit, go_on)? == target {
                 high = self.largest();
             } else {
                 // Something above the limit is needed.

@@ -5,16 +5,16 @@
 //! Rosenfeld 1985). So the best matchings are known without one search: agent after agent takes the lowest goal that is left up
 //! to the next gaps without flow, and the flow on its way becomes one less. n log n steps and no rounding.
 
-use crate::AssignError;
 use crate::fixed::Scale;
+use crate::{AssignError, GoOn, Result};
 
 /// The lowest best matching, `[rows]`, if the points are on a line along an axis and all differences of their coordinates are
 /// doubles; as many agents as goals.
 pub(super) fn solve<const D: usize>(
     agents: &[[f64; D]],
     goals: &[[f64; D]],
-    should_continue: &dyn Fn() -> bool,
-) -> Option<Result<Vec<u32>, AssignError>> {
+    go_on: GoOn<'_>,
+) -> Option<Result<Vec<u32>>> {
     let axis = axis_of(agents, goals)?;
     let along = |point: &[f64; D]| point[axis];
     let mut places: Vec<f64> = agents.iter().chain(goals).map(along).collect();
@@ -34,7 +34,7 @@ pub(super) fn solve<const D: usize>(
     let (mut flow, mut lowest) = (Flow::new(&flow), Lowest::new(&goals_at));
     let mut goal_of = Vec::with_capacity(agents.len());
     for agent in agents {
-        if goal_of.len() % 1024 == 0 && !should_continue() {
+        if goal_of.len() % 1024 == 0 && !go_on() {
             return Some(Err(AssignError::Interrupted));
         }
         let own = place(agent);

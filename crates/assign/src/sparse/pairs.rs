@@ -4,7 +4,9 @@ use super::candidates::Candidates;
 use super::tree::Found;
 use super::{Order, solve};
 use crate::ties::Exact;
-use crate::{AssignError, Assignment, LARGEST_COST, Span, Switching, UNASSIGNED, check_shape, compensated_sum};
+use crate::{
+    AssignError, Assignment, GoOn, LARGEST_COST, Result, Span, Switching, UNASSIGNED, check_shape, compensated_sum,
+};
 
 /// The pairs that may be, and what they cost.
 #[derive(Debug, Clone, Copy)]
@@ -21,16 +23,16 @@ pub struct AllowedPairs<'a> {
 
 /// As many pairs as possible, then the smallest summed cost + switching cost × switches, then the fewest switches, then the
 /// lowest matching, as [`crate::Solver::solve_switching`] of the matrix with +∞ for the other pairs, in memory that grows with
-/// the list. Stops as soon as `should_continue` returns false.
+/// the list. Stops as soon as `go_on` returns false.
 /// Fails for pairs beyond the shape and costs that are NaN, −∞ or beyond 1e300.
-pub fn solve_pairs(problem: &AllowedPairs<'_>, should_continue: &dyn Fn() -> bool) -> Result<Assignment, AssignError> {
+pub fn solve_pairs(problem: &AllowedPairs<'_>, go_on: GoOn<'_>) -> Result<Assignment> {
     let &AllowedPairs { rows, cols, .. } = problem;
     check_shape(rows, cols)?;
     problem.switching.check(rows, cols)?;
     let turned = rows > cols;
     let list = List::new(problem, turned)?;
     let order = Order { row_at: (0..list.rows as u32).collect(), col_at: (0..list.cols as u32).collect() };
-    let col_of_row = solve(&list, &order, &list, should_continue)?;
+    let col_of_row = solve(&list, &order, &list, go_on)?;
     let mut answer = vec![UNASSIGNED; rows];
     for (row, &col) in (0u32..).zip(&col_of_row).filter(|(_, col)| (**col as usize) < list.cols) {
         let (agent, goal) = if turned { (col, row) } else { (row, col) };
@@ -58,7 +60,7 @@ struct List {
 }
 
 impl List {
-    fn new(problem: &AllowedPairs<'_>, turned: bool) -> Result<Self, AssignError> {
+    fn new(problem: &AllowedPairs<'_>, turned: bool) -> Result<Self> {
         let (rows, cols) = (problem.rows.min(problem.cols), problem.rows.max(problem.cols));
         let mut pairs = Vec::with_capacity(problem.pairs.len());
         for (k, &(row, col, cost)) in problem.pairs.iter().enumerate() {
@@ -173,7 +175,7 @@ impl Candidates for &List {
         None
     }
 
-    fn spread(&mut self, _: &Self, _: &[f64], _: &mut Vec<f64>, _: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    fn spread(&mut self, _: &Self, _: &[f64], _: &mut Vec<f64>, _: GoOn<'_>) -> Result<()> {
         Ok(())
     }
 

@@ -12,7 +12,7 @@ mod simplex;
 
 use super::costs::{Metric, OwnCost, OwnCosts};
 use super::points::Points;
-use crate::AssignError;
+use crate::{GoOn, Result};
 use lowest::Tight;
 use market::Market;
 
@@ -107,10 +107,7 @@ impl<const D: usize> Counted<D> {
 }
 
 /// The goal of every agent, if places are worth counting.
-pub(super) fn solve<const D: usize>(
-    problem: &Problem<'_, D>,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Option<Vec<u32>>, AssignError> {
+pub(super) fn solve<const D: usize>(problem: &Problem<'_, D>, go_on: GoOn<'_>) -> Result<Option<Vec<u32>>> {
     let &Problem { short, long, metric, own, largest_cost, sink, turned } = problem;
     let Some(Counted { short_at, long_at, own }) = Counted::new(short, long, own) else {
         return Ok(None);
@@ -135,7 +132,7 @@ pub(super) fn solve<const D: usize>(
     let finite = own_at.pairs.iter().map(OwnCost::cost).filter(|cost| *cost < f64::INFINITY);
     let magnitude = finite.fold(largest_cost.abs().max(without.abs()), |most, cost| most.max(cost.abs()));
     let mut market = Market { source, supply, demand, no_row, no_col, magnitude };
-    let Some(flows) = market.solve(should_continue)? else {
+    let Some(flows) = market.solve(go_on)? else {
         return Ok(None);
     };
     let agents_are_rows = turned == flipped;
@@ -151,7 +148,7 @@ pub(super) fn solve<const D: usize>(
     (0u32..).zip(agent_order).for_each(|(number, &place)| solved[place as usize] = number);
     let agents: Vec<u32> = agents_at.place.iter().map(|&place| solved[place as usize]).collect();
     let goals: Vec<&[u32]> = goal_order.iter().map(|&place| goals_at.members(place)).collect();
-    lowest::lowest(arcs, &agents, &goals, [agent_order.len() + 1, goal_order.len() + 1], should_continue)
+    lowest::lowest(arcs, &agents, &goals, [agent_order.len() + 1, goal_order.len() + 1], go_on)
 }
 
 #[cfg(test)]

@@ -6,7 +6,10 @@ use super::costs::{Metric, OwnCost, OwnCosts};
 use super::{line, places, solve};
 use crate::points::{check_points, check_power};
 use crate::ties::Exact;
-use crate::{AssignError, Assignment, LARGEST_COST, Solver, Span, Switching, UNASSIGNED, compensated_sum, costs_into};
+use crate::{
+    AssignError, Assignment, GoOn, LARGEST_COST, Result, Solver, Span, Switching, UNASSIGNED, compensated_sum,
+    costs_into,
+};
 
 pub(super) use source::Points;
 
@@ -45,7 +48,7 @@ impl<'a, T> PointProblem<'a, T> {
 
 /// As many pairs as possible, then the smallest summed cost + switching cost × switches, then the fewest switches, then the
 /// lowest matching, as [`Solver::solve_switching`] of the matrix of costs, in memory that grows with the points only.
-/// Positions have 1 to 3 coordinates; more are solved by the matrix. Stops as soon as `should_continue` returns false.
+/// Positions have 1 to 3 coordinates; more are solved by the matrix. Stops as soon as `go_on` returns false.
 ///
 /// Points on a line along an axis (as many agents as goals, power 1, no costs of their own and no pairs in force, and
 /// differences of coordinates that are doubles) take n log n steps, although nearly all their pairs are equally good.
@@ -57,17 +60,14 @@ impl<'a, T> PointProblem<'a, T> {
 /// equally good within 10^-12 of the largest costs (more than 5,792 points on an oblique line, or on any line with unequal
 /// numbers), the answer is as cheap as doubles can tell and deterministic, but not always the lowest one. Where points share
 /// places so often that these are counted (four points for each place of one side, or two of both), pairs of places count.
-pub fn solve_points<T: Copy + Into<f64>>(
-    problem: &PointProblem<'_, T>,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+pub fn solve_points<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>, go_on: GoOn<'_>) -> Result<Assignment> {
     let (rows, cols) = check(problem)?;
     if rows.max(cols) < WORTH_IT || problem.dims > 3 {
         let cost = matrix(problem)?;
-        return Solver::default().solve_switching(&cost, rows, cols, &problem.switching, should_continue);
+        return Solver::default().solve_switching(&cost, rows, cols, &problem.switching, go_on);
     }
     let (agents, goals) = (in_doubles(problem.agents), in_doubles(problem.goals));
-    solve_sparse(&problem.with(&agents, &goals), rows, cols, Limit::NONE, should_continue)
+    solve_sparse(&problem.with(&agents, &goals), rows, cols, Limit::NONE, go_on)
 }
 
 /// Largest cost of a pair.
@@ -83,7 +83,7 @@ impl Limit {
 }
 
 /// The matrix of all costs.
-pub(super) fn matrix<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<Vec<f64>, AssignError> {
+pub(super) fn matrix<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<Vec<f64>> {
     let mut cost = Vec::new();
     let (_, cols) = costs_into(problem.agents, problem.goals, problem.dims, problem.power, &mut cost)?;
     for &(row, col, own) in problem.costs {
@@ -93,7 +93,7 @@ pub(super) fn matrix<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Resu
 }
 
 /// Checks a problem; returns (rows, columns).
-pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<(usize, usize), AssignError> {
+pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Result<(usize, usize)> {
     check_power(problem.power)?;
     let (rows, cols) = check_points(problem.agents, problem.goals, problem.dims)?;
     problem.switching.check(rows, cols)?;
@@ -112,11 +112,7 @@ pub(super) fn check<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>) -> Resul
 
 /// Assigns agents `[rows, dims]` to goals `[cols, dims]` by Euclidean distance (computed in f64): the goal of each
 /// agent ([`UNASSIGNED`] if there are fewer goals) and the summed distance.
-pub fn exact_points<T: Copy + Into<f64>>(
-    agents: &[T],
-    goals: &[T],
-    dims: usize,
-) -> Result<(Vec<u32>, f64), AssignError> {
+pub fn exact_points<T: Copy + Into<f64>>(agents: &[T], goals: &[T], dims: usize) -> Result<(Vec<u32>, f64)> {
     let answer = solve_points(&PointProblem::new(agents, goals, dims), &|| true)?;
     Ok((answer.col_of_row, answer.cost))
 }
@@ -127,12 +123,12 @@ pub(super) fn solve_sparse(
     rows: usize,
     cols: usize,
     limit: Limit,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Assignment> {
     match problem.dims {
-        1 => solve_dims::<1>(problem, rows, cols, limit, should_continue),
-        2 => solve_dims::<2>(problem, rows, cols, limit, should_continue),
-        _ => solve_dims::<3>(problem, rows, cols, limit, should_continue),
+        1 => solve_dims::<1>(problem, rows, cols, limit, go_on),
+        2 => solve_dims::<2>(problem, rows, cols, limit, go_on),
+        _ => solve_dims::<3>(problem, rows, cols, limit, go_on),
     }
 }
 
@@ -141,14 +137,14 @@ fn solve_dims<const D: usize>(
     rows: usize,
     cols: usize,
     limit: Limit,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Assignment> {
     let turned = rows > cols;
     let metric = Metric { power: problem.power, limit: limit.cost };
     let (agents, goals) = (problem.agents.as_chunks::<D>().0, problem.goals.as_chunks::<D>().0);
     let own = own_costs(problem, agents, goals, metric);
     let plain = own.is_empty() && problem.power == 1.0 && limit.cost == f64::INFINITY;
-    if plain && let Some(goal_of) = line::solve(agents, goals, should_continue) {
+    if plain && let Some(goal_of) = line::solve(agents, goals, go_on) {
         let goal_of = goal_of?;
         let cost = crate::pairs(&goal_of).map(|(agent, goal)| metric.cost(&agents[agent], &goals[goal]));
         return Ok(Assignment { cost: compensated_sum(cost), col_of_row: goal_of });
@@ -158,11 +154,11 @@ fn solve_dims<const D: usize>(
     let (short, long) = if turned { (goals, agents) } else { (agents, goals) };
     let exact = PointCosts { from: short, to: long, metric, own: &own, sink: sink.unwrap_or(0.0), turned };
     let counted = places::Problem { short, long, metric, own: &own, largest_cost, sink, turned };
-    if let Some(goal_of) = places::solve(&counted, should_continue)? {
+    if let Some(goal_of) = places::solve(&counted, go_on)? {
         return Ok(Assignment { cost: exact.sum(&goal_of), col_of_row: goal_of });
     }
     let (source, order) = Points::new(short, long, metric, &own, largest_cost, sink);
-    let col_of_row = solve(source, &order, &exact, should_continue)?;
+    let col_of_row = solve(source, &order, &exact, go_on)?;
     let mut goal_of = vec![UNASSIGNED; rows];
     for (row, &col) in (0u32..).zip(&col_of_row).filter(|(_, col)| (**col as usize) < long.len()) {
         let (agent, goal) = if turned { (col, row) } else { (row, col) };
@@ -207,7 +203,7 @@ fn largest_costs<const D: usize>(
     agents: &[[f64; D]],
     goals: &[[f64; D]],
     metric: Metric,
-) -> Result<(f64, Option<f64>), AssignError> {
+) -> Result<(f64, Option<f64>)> {
     let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
     for point in agents.iter().chain(goals) {
         for axis in 0..D {

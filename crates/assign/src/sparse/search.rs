@@ -2,8 +2,8 @@
 
 use super::NONE;
 use super::candidates::{COUNT, Candidates, Engine};
-use crate::AssignError;
 use crate::greedy::ascending;
+use crate::{AssignError, GoOn, Result};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -33,7 +33,7 @@ struct Known {
 
 impl<C: Candidates> Engine<C> {
     /// Gives every row without a column one; the others' columns are within ε of their cheapest.
-    pub(super) fn search(&mut self, epsilon: f64, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    pub(super) fn search(&mut self, epsilon: f64, go_on: GoOn<'_>) -> Result<()> {
         let (rows, places) = (self.col_of_row.len(), self.row_of_col.len());
         let mut known = Known {
             stamp: 0,
@@ -52,7 +52,7 @@ impl<C: Candidates> Engine<C> {
         // A column that stays alone keeps its price where there are more columns than rows: then one path at a time.
         let together = if rows == places { rows } else { 1 };
         while !free.is_empty() {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             known.stamp += 2;
@@ -60,7 +60,7 @@ impl<C: Candidates> Engine<C> {
             known.finals.clear();
             known.closed = 0;
             let starts = free.len().saturating_sub(together);
-            let found = self.augment(&free[starts..], epsilon, &mut known, should_continue);
+            let found = self.augment(&free[starts..], epsilon, &mut known, go_on);
             let cols = self.price.len() as u32;
             let closed = known.finals[..known.closed].iter().filter(|col| **col < cols);
             closed.for_each(|&col| self.source.reopen(col));
@@ -71,13 +71,7 @@ impl<C: Candidates> Engine<C> {
     }
 
     /// Finds shortest paths from free rows to free columns, until half of the rows have one, and flips them.
-    fn augment(
-        &mut self,
-        starts: &[u32],
-        epsilon: f64,
-        known: &mut Known,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn augment(&mut self, starts: &[u32], epsilon: f64, known: &mut Known, go_on: GoOn<'_>) -> Result<()> {
         let places = self.row_of_col.len() as u32;
         let done = known.stamp + 1;
         known.ends.clear();
@@ -105,7 +99,7 @@ impl<C: Candidates> Engine<C> {
             known.col[at] = done;
             known.finals.push(id);
             self.reached += 1;
-            if known.finals.len().is_multiple_of(4096) && !should_continue() {
+            if known.finals.len().is_multiple_of(4096) && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             let length = known.distance[at];

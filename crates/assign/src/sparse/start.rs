@@ -7,7 +7,7 @@
 //! matrix. Whatever the guess, the auction and the shortest paths make the prices right.
 
 use super::candidates::{Candidates, Engine};
-use crate::{AssignError, Solver};
+use crate::{GoOn, Result, Solver};
 
 /// Rows of the problem for each row of the smaller one.
 const RATIO: usize = 4;
@@ -20,7 +20,7 @@ const STAGES: usize = 4;
 
 impl<C: Candidates> Engine<C> {
     /// Begins with the prices that a smaller problem suggests. As many rows as columns.
-    pub(super) fn guess(&mut self, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    pub(super) fn guess(&mut self, go_on: GoOn<'_>) -> Result<()> {
         let rows = self.col_of_row.len();
         if rows < SMALLEST {
             return Ok(());
@@ -29,8 +29,8 @@ impl<C: Candidates> Engine<C> {
             return Ok(());
         };
         let mut engine = Engine::new(sample);
-        let least = engine.least(should_continue)?;
-        self.source.spread(&engine.source, &least, &mut self.price, should_continue)?;
+        let least = engine.least(go_on)?;
+        self.source.spread(&engine.source, &least, &mut self.price, go_on)?;
         self.bids += engine.bids;
         self.looks += engine.looks;
         self.reached += engine.reached;
@@ -38,19 +38,19 @@ impl<C: Candidates> Engine<C> {
     }
 
     /// Nearly the least cost − price of every row.
-    fn least(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Vec<f64>, AssignError> {
+    fn least(&mut self, go_on: GoOn<'_>) -> Result<Vec<f64>> {
         let rows = self.col_of_row.len();
         if rows <= MATRIX {
             let mut cost = Vec::with_capacity(rows * rows);
             for row in 0..rows as u32 {
                 cost.extend((0..rows as u32).map(|col| self.source.cost(row, col)));
             }
-            return Solver::default().row_prices(&cost, rows, should_continue);
+            return Solver::default().row_prices(&cost, rows, go_on);
         }
-        self.guess(should_continue)?;
-        let epsilon = self.stages(STAGES, should_continue)?;
+        self.guess(go_on)?;
+        let epsilon = self.stages(STAGES, go_on)?;
         // What the auction has left over is what must go far.
-        self.search(epsilon, should_continue)?;
+        self.search(epsilon, go_on)?;
         Ok((0..rows as u32).map(|row| self.best(row).least).collect())
     }
 }

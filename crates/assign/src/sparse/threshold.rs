@@ -10,24 +10,21 @@ use super::costs::{Metric, OwnCosts};
 use super::growing::{Growing, Seeker};
 use super::places::{Counted, Shares};
 use super::points::{Limit, PointProblem, WORTH_IT, check, in_doubles, matrix, own_costs, solve_sparse};
-use crate::{AssignError, Assignment, BottleneckSolver, UNASSIGNED, pairs};
+use crate::{AssignError, Assignment, BottleneckSolver, GoOn, Result, UNASSIGNED, pairs};
 
 /// As many pairs as possible, then the smallest largest cost, then as [`super::solve_points`]: the answer of
 /// [`BottleneckSolver::solve_switching`] of the matrix of costs, in memory that grows with the points only.
 /// With pairs in force and a switching cost, and with more than three coordinates, the matrix is used.
-pub fn bottleneck_points<T: Copy + Into<f64>>(
-    problem: &PointProblem<'_, T>,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+pub fn bottleneck_points<T: Copy + Into<f64>>(problem: &PointProblem<'_, T>, go_on: GoOn<'_>) -> Result<Assignment> {
     let (rows, cols) = check(problem)?;
     let switching = &problem.switching;
     let switches = switching.cost > 0.0 && pairs(switching.current).next().is_some();
     if rows.max(cols) < WORTH_IT || problem.dims > 3 || switches {
         let cost = matrix(problem)?;
-        return BottleneckSolver::default().solve_switching(&cost, rows, cols, switching, should_continue);
+        return BottleneckSolver::default().solve_switching(&cost, rows, cols, switching, go_on);
     }
     let (agents, goals) = (in_doubles(problem.agents), in_doubles(problem.goals));
-    bottleneck_sparse(&problem.with(&agents, &goals), rows, cols, should_continue)
+    bottleneck_sparse(&problem.with(&agents, &goals), rows, cols, go_on)
 }
 
 /// Without the matrix, and without regard to a switching cost.
@@ -35,31 +32,28 @@ pub(super) fn bottleneck_sparse(
     problem: &PointProblem<'_, f64>,
     rows: usize,
     cols: usize,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Assignment, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Assignment> {
     let limit = match problem.dims {
-        1 => threshold::<1>(problem, should_continue)?,
-        2 => threshold::<2>(problem, should_continue)?,
-        _ => threshold::<3>(problem, should_continue)?,
+        1 => threshold::<1>(problem, go_on)?,
+        2 => threshold::<2>(problem, go_on)?,
+        _ => threshold::<3>(problem, go_on)?,
     };
     match limit {
-        Some(limit) => solve_sparse(problem, rows, cols, limit, should_continue),
+        Some(limit) => solve_sparse(problem, rows, cols, limit, go_on),
         None => Ok(Assignment { col_of_row: vec![UNASSIGNED; rows], cost: 0.0 }),
     }
 }
 
 /// The smallest largest cost; nothing if all pairs are forbidden.
-fn threshold<const D: usize>(
-    problem: &PointProblem<'_, f64>,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Option<Limit>, AssignError> {
+fn threshold<const D: usize>(problem: &PointProblem<'_, f64>, go_on: GoOn<'_>) -> Result<Option<Limit>> {
     let metric = Metric { power: problem.power, limit: f64::INFINITY };
     let (agents, goals) = (problem.agents.as_chunks::<D>().0, problem.goals.as_chunks::<D>().0);
     let own = own_costs(problem, agents, goals, metric);
     let (short, long) = if agents.len() > goals.len() { (goals, agents) } else { (agents, goals) };
     match Counted::new(short, long, &own) {
-        Some(counted) => Shares::new(&counted, metric).search(should_continue),
-        None => Matching::new(short, long, metric, &own).search(should_continue),
+        Some(counted) => Shares::new(&counted, metric).search(go_on),
+        None => Matching::new(short, long, metric, &own).search(go_on),
     }
 }
 
@@ -101,7 +95,7 @@ impl<const D: usize> Growing<D> for Matching<D> {
     }
 
     /// Makes the matching a largest one of pairs up to the limit; returns its size.
-    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError> {
+    fn grow(&mut self, limit: f64, go_on: GoOn<'_>) -> Result<usize> {
         let rows = self.col_of_row.len() as u32;
         for row in 0..rows {
             let col = self.col_of_row[row as usize];
@@ -111,7 +105,7 @@ impl<const D: usize> Growing<D> for Matching<D> {
         }
         let mut path: Vec<(u32, u32)> = Vec::new();
         loop {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             self.seeker.left.restore();

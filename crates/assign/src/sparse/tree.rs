@@ -136,21 +136,13 @@ impl<const D: usize> Tree<D> {
 
     /// Puts the children of a node that may hold a point of cost − price below the limit on the stack, the most promising last.
     #[inline(always)]
-    fn open(
-        &self,
-        place: u32,
-        from: &[f64; D],
-        metric: &Metric,
-        limit: f64,
-        only_open: bool,
-        stack: &mut Vec<(u32, f64)>,
-    ) {
+    fn open(&self, place: u32, from: &[f64; D], metric: &Metric, limit: f64, free: bool, stack: &mut Vec<(u32, f64)>) {
         let node = &self.nodes[place as usize];
         let bounds = node.bounds(from, metric);
         let first = stack.len();
         for lane in 0..FAN {
             let bound = bounds[lane];
-            if bound < limit && !(only_open && node.open[lane] == 0) {
+            if bound < limit && !(free && node.open[lane] == 0) {
                 let mut at = stack.len();
                 stack.push((node.child[lane], bound));
                 while at > first && stack[at - 1].1 < bound {

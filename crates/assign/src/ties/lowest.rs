@@ -6,7 +6,7 @@
 
 use super::components::Components;
 use super::{Exact, Graph, NONE, Solution};
-use crate::AssignError;
+use crate::{AssignError, GoOn, Result};
 use std::borrow::Cow;
 
 /// Searches look at this many times the pairs there are, before the graph is cleared up.
@@ -18,11 +18,11 @@ pub(super) fn lowest(
     spare: &[bool],
     solution: &mut Solution<'_>,
     exact: &impl Exact,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<(), AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<()> {
     let mut graph = Cow::Borrowed(tight);
     let mut first = 0;
-    while let Some(next) = choose(&graph, spare, first, solution, exact, should_continue)? {
+    while let Some(next) = choose(&graph, spare, first, solution, exact, go_on)? {
         // Agents that have chosen break cycles: what can lead nowhere any more is taken out.
         let left = without_chosen(&graph, next, solution, exact);
         let may_idle =
@@ -41,17 +41,17 @@ fn choose(
     first: usize,
     solution: &mut Solution<'_>,
     exact: &impl Exact,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Option<usize>, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Option<usize>> {
     if exact.by_columns() {
         let goals = transposed(graph, solution.col_price.len());
         let mut choice = Choice::new(&goals, solution.row_of_col, solution.col_of_row);
         choice.idle = Some(spare);
-        return choice.run(first, &|agent, goal| exact.forbidden(goal, agent), should_continue);
+        return choice.run(first, &|agent, goal| exact.forbidden(goal, agent), go_on);
     }
     let mut choice = Choice::new(graph, solution.col_of_row, solution.row_of_col);
     choice.spare = Some(spare);
-    choice.run(first, &|agent, goal| exact.forbidden(agent, goal), should_continue)
+    choice.run(first, &|agent, goal| exact.forbidden(agent, goal), go_on)
 }
 
 /// The pairs without those of the agents before `next`, which have chosen, and of their goals. One that has none may still
@@ -142,19 +142,14 @@ impl<'a> Choice<'a> {
         }
     }
 
-    fn run(
-        mut self,
-        first: usize,
-        forbidden: &dyn Fn(usize, usize) -> bool,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Option<usize>, AssignError> {
+    fn run(mut self, first: usize, forbidden: &dyn Fn(usize, usize) -> bool, go_on: GoOn<'_>) -> Result<Option<usize>> {
         let mut round = 0;
         (0..first).for_each(|agent| self.settle(agent, forbidden));
         for agent in first..self.goals.rows() {
             if self.goals.of(agent).is_empty() {
                 continue;
             }
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             round += 1;

@@ -6,8 +6,8 @@
 
 use super::components::Components;
 use super::{Exact, Graph, NONE, Solution};
-use crate::AssignError;
 use crate::fixed::{Fixed, Scale};
+use crate::{AssignError, GoOn, Result};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -27,8 +27,8 @@ pub(super) fn repair(
     parts: &Components,
     solution: &mut Solution<'_>,
     exact: &impl Exact,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Tight, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Tight> {
     if let Some(spare) = tight_already(tied, &|row| parts.pooled(row), solution, exact) {
         return Ok(Tight { graph: tied.clone(), spare });
     }
@@ -48,11 +48,11 @@ pub(super) fn repair(
     let bits = scale.bits() + switches + 2 + (usize::BITS - tied.rows().leading_zeros()) + 3;
     let input = Input { tied, parts, exact, unit: scale.unit(), switches };
     match bits {
-        ..=128 => Repair::<2>::run(&input, solution, should_continue),
-        129..=256 => Repair::<4>::run(&input, solution, should_continue),
-        257..=640 => Repair::<10>::run(&input, solution, should_continue),
+        ..=128 => Repair::<2>::run(&input, solution, go_on),
+        129..=256 => Repair::<4>::run(&input, solution, go_on),
+        257..=640 => Repair::<10>::run(&input, solution, go_on),
         // All doubles there are.
-        _ => Repair::<36>::run(&input, solution, should_continue),
+        _ => Repair::<36>::run(&input, solution, go_on),
     }
 }
 
@@ -116,11 +116,7 @@ enum Known {
 }
 
 impl<const N: usize> Repair<'_, N> {
-    fn run(
-        input: &Input<'_, impl Exact>,
-        solution: &mut Solution<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Tight, AssignError> {
+    fn run(input: &Input<'_, impl Exact>, solution: &mut Solution<'_>, go_on: GoOn<'_>) -> Result<Tight> {
         let &Input { tied, parts, exact, unit, switches } = input;
         let cols = solution.col_price.len();
         let of = |value: f64| Fixed::<N>::of(value, unit).shifted(switches);
@@ -151,8 +147,8 @@ impl<const N: usize> Repair<'_, N> {
             touched: Vec::new(),
         };
         let freed = repair.free(solution);
-        for row in repair.bid(freed, solution, should_continue)? {
-            if !should_continue() {
+        for row in repair.bid(freed, solution, go_on)? {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             repair.augment(row, solution);
@@ -184,16 +180,11 @@ impl<const N: usize> Repair<'_, N> {
     /// Every freed row takes its cheapest column at a price that makes the second cheapest as good, and the row that had it is
     /// next (Jonker & Volgenant's augmenting row reduction): rounding frees many rows, and this is faster than a path for each.
     /// Returns the rows that are left.
-    fn bid(
-        &mut self,
-        freed: Vec<u32>,
-        solution: &mut Solution<'_>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Vec<u32>, AssignError> {
+    fn bid(&mut self, freed: Vec<u32>, solution: &mut Solution<'_>, go_on: GoOn<'_>) -> Result<Vec<u32>> {
         let mut left = Vec::new();
         let mut budget = BIDS * freed.len();
         for first in freed {
-            if !should_continue() {
+            if !go_on() {
                 return Err(AssignError::Interrupted);
             }
             let mut row = first;
@@ -224,7 +215,7 @@ impl<const N: usize> Repair<'_, N> {
                     break;
                 }
                 budget = budget.saturating_sub(1);
-                if budget % 256 == 255 && !should_continue() {
+                if budget % 256 == 255 && !go_on() {
                     return Err(AssignError::Interrupted);
                 }
                 self.price[at] = self.price[at].minus(margin);

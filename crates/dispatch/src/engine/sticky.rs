@@ -1,7 +1,7 @@
 //! Switching costs: current pairs are cheaper, and a preferred matching is followed only where it saves more than they cost.
 
 use crate::UNASSIGNED;
-use magex_assign::{AssignError, Solver, pairs};
+use magex_assign::{GoOn, Result, Solver, pairs};
 
 /// Minimum gain of leaving a pair, relative to its own cost: more than the rounding of sums.
 const WORTH: f64 = 1e-9;
@@ -40,9 +40,9 @@ pub(super) fn follow(
     cols: usize,
     current: &[u32],
     solver: &mut Solver,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Vec<u32>, AssignError> {
-    let kept = keep(wish, adjusted, cols, current, solver, should_continue)?;
+    go_on: GoOn<'_>,
+) -> Result<Vec<u32>> {
+    let kept = keep(wish, adjusted, cols, current, solver, go_on)?;
     let rows = wish.len();
     let mut groups = Groups::new(rows + cols);
     let apart: Vec<usize> = (0..rows).filter(|&agent| kept[agent] != wish[agent]).collect();
@@ -80,8 +80,8 @@ fn keep(
     cols: usize,
     current: &[u32],
     solver: &mut Solver,
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Vec<u32>, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Vec<u32>> {
     let (mut kept, mut free) = (vec![UNASSIGNED; wish.len()], vec![true; cols]);
     for (agent, goal) in pairs(current) {
         if adjusted[agent * cols + goal] < f64::INFINITY {
@@ -100,7 +100,7 @@ fn keep(
     }
     let rest: Vec<f64> =
         agents.iter().flat_map(|agent| goals.iter().map(move |goal| adjusted[agent * cols + goal])).collect();
-    let filled = solver.solve_allowed(&rest, agents.len(), goals.len(), should_continue)?;
+    let filled = solver.solve_allowed(&rest, agents.len(), goals.len(), go_on)?;
     for (row, col) in filled.pairs() {
         kept[agents[row]] = goals[col] as u32;
     }

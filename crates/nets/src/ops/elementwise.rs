@@ -5,35 +5,47 @@ use wide::f32x16;
 
 /// eˣ with the same bits on every machine (candle's calls the platform's libm). NaN, overflow and underflow as in IEEE.
 pub fn exp(x: &Tensor) -> Result<Tensor> {
-    apply1(Elementwise::Exp, x)
+    map(x, |x| x.exp(), |_, y| y)
 }
 
 /// Hyperbolic tangent with the same bits on every machine.
 pub fn tanh(x: &Tensor) -> Result<Tensor> {
-    apply1(Elementwise::Tanh, x)
+    map(x, simd::tanh, |_, y| f32x16::ONE - y * y)
 }
 
 /// min(max(x, low), high) with derivative 1 between the bounds, which count as between: one operation, where candle takes thirty with
 /// the gradients of both bounds.
 pub fn clamp(x: &Tensor, low: f32, high: f32) -> Result<Tensor> {
-    apply1(Elementwise::Clamp(low, high), x)
+    map(x, move |x| between(x, low, high), |x, y| x.simd_eq(y) & f32x16::ONE)
 }
 
 /// Huber loss (Huber 1964): e²/2 for |e| ≤ δ, δ (|e| − δ/2) beyond (candle-nn's has the mean of them only). With m = min(|e|, δ)
 /// both are m (|e| − m/2), whose derivative is m with the sign of e.
 pub fn huber(error: &Tensor, delta: f32) -> Result<Tensor> {
-    apply1(Elementwise::Huber(delta), error)
+    let value = move |e: f32x16| {
+        let inner = between(e.abs(), 0.0, delta);
+        inner * (e.abs() - inner * f32x16::splat(0.5))
+    };
+    map(error, value, move |e, _| between(e, -delta, delta))
 }
 
 /// Exponential linear unit: x above zero, eˣ − 1 elsewhere.
 pub fn elu(x: &Tensor) -> Result<Tensor> {
-    apply1(Elementwise::Elu, x)
+    let (zero, one) = (f32x16::ZERO, f32x16::ONE);
+    // The bound first, see `between`.
+    let value = move |x: f32x16| zero.fast_max(x) + (zero.fast_min(x).exp() - one);
+    map(x, value, move |_, y| one + zero.fast_min(y))
 }
 
 /// Gaussian error linear unit in its hyperbolic form (Hendrycks & Gimpel 2016): x/2 · (1 + tanh(√(2/π) (x + 0.044715 x³))),
 /// within 5e-4 of x Φ(x).
 pub fn gelu(x: &Tensor) -> Result<Tensor> {
-    apply1(Gelu, x)
+    let (half, one) = (f32x16::splat(0.5), f32x16::ONE);
+    map(x, gelu_lanes, move |x, _| {
+        let gate = gelu_gate(x);
+        let inner = (x * x).mul_add(f32x16::splat(3.0 * GELU_CUBE), one) * f32x16::splat(GELU_SCALE);
+        half * (one + gate) + half * x * (one - gate * gate) * inner
+    })
 }
 
 /// Softmax over the last dimension, on [`exp()`].
@@ -42,66 +54,47 @@ pub fn softmax(x: &Tensor) -> Result<Tensor> {
     exps.broadcast_div(&exps.sum_keepdim(D::Minus1)?)
 }
 
-/// A function whose derivative can be written in terms of its value (and of x, for a clamp).
-enum Elementwise {
-    Exp,
-    Tanh,
-    Elu,
-    Clamp(f32, f32),
-    Huber(f32),
+/// A function of each number, and its derivative in terms of x and y.
+struct Map<V, S> {
+    value: V,
+    slope: S,
 }
 
-impl Operation<1> for Elementwise {
+fn map<V, S>(x: &Tensor, value: V, slope: S) -> Result<Tensor>
+where
+    V: Fn(f32x16) -> f32x16 + Send + Sync + 'static,
+    S: Fn(f32x16, f32x16) -> f32x16 + Send + Sync + 'static,
+{
+    apply1(Map { value, slope }, x)
+}
+
+impl<V, S> Operation<1> for Map<V, S>
+where
+    V: Fn(f32x16) -> f32x16 + Send + Sync + 'static,
+    S: Fn(f32x16, f32x16) -> f32x16 + Send + Sync + 'static,
+{
     const NAME: &'static str = "elementwise";
 
     fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
-        if let Self::Huber(delta) = self {
-            let losses = x.values.iter().map(|e| {
-                let (size, inner) = (e.abs(), clamped(e.abs(), *delta));
-                inner * (size - inner * 0.5)
-            });
-            return Ok((losses.collect(), Shape::from(x.dims)));
-        }
-        let mut y = vec![0.0; x.values.len()];
-        let chunks = x.values.chunks(LANES).zip(y.chunks_mut(LANES));
-        match self {
-            Self::Exp | Self::Elu => chunks.for_each(|(x, y)| store(load(x).exp(), y)),
-            Self::Tanh => chunks.for_each(|(x, y)| store(simd::tanh(load(x)), y)),
-            Self::Clamp(low, high) => {
-                // The bound first: of two operands the instruction gives the second one if one of them is NaN.
-                let (low, high) = (f32x16::splat(*low), f32x16::splat(*high));
-                chunks.for_each(|(x, y)| store(high.fast_min(low.fast_max(load(x))), y));
-            }
-            Self::Huber(_) => {}
-        }
-        if matches!(self, Self::Elu) {
-            y.iter_mut().zip(x.values).for_each(|(y, &x)| *y = if x > 0.0 { x } else { *y - 1.0 });
-        }
+        let mut y = x.values.to_vec();
+        y.chunks_mut(LANES).for_each(|y| store((self.value)(load(y)), y));
         Ok((y, Shape::from(x.dims)))
     }
 
     fn backward(&self, [x]: [Arg<'_>; 1], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
-        let pairs = y.iter().zip(dy);
-        Ok([Some(match self {
-            Self::Exp => pairs.map(|(y, d)| d * y).collect(),
-            Self::Tanh => pairs.map(|(y, d)| d * (1.0 - y * y)).collect(),
-            Self::Elu => pairs.map(|(y, d)| d * if *y > 0.0 { 1.0 } else { y + 1.0 }).collect(),
-            Self::Huber(delta) => {
-                let errors = x.values.iter().zip(dy);
-                errors.map(|(e, d)| d * clamped(e.abs(), *delta).copysign(*e)).collect()
-            }
-            Self::Clamp(..) => x.values.iter().zip(pairs).map(|(x, (y, d))| if x == y { *d } else { 0.0 }).collect(),
-        })])
+        let mut dx = dy.to_vec();
+        for ((x, y), d) in x.values.chunks(LANES).zip(y.chunks(LANES)).zip(dx.chunks_mut(LANES)) {
+            store(load(d) * (self.slope)(load(x), load(y)), d);
+        }
+        Ok([Some(dx)])
     }
 }
 
-/// min(x, high) that keeps what is no number.
+/// min(max(x, low), high). The bound comes first: of two operands the instruction gives the second one if one of them is NaN.
 #[inline(always)]
-fn clamped(x: f32, high: f32) -> f32 {
-    if x > high { high } else { x }
+fn between(x: f32x16, low: f32, high: f32) -> f32x16 {
+    f32x16::splat(high).fast_min(f32x16::splat(low).fast_max(x))
 }
-
-struct Gelu;
 
 const GELU_SCALE: f32 = 0.797_884_6;
 const GELU_CUBE: f32 = 0.044_715;
@@ -113,13 +106,6 @@ fn gelu_gate(x: f32x16) -> f32x16 {
     simd::tanh(inner * f32x16::splat(GELU_SCALE))
 }
 
-/// [`gelu`] of plain numbers, with the same bits.
-pub(crate) fn gelu_in_place(x: &mut [f32]) {
-    for x in x.chunks_mut(LANES) {
-        store(gelu_lanes(load(x)), x);
-    }
-}
-
 /// GELU of sixteen numbers.
 #[inline(always)]
 fn gelu_lanes(x: f32x16) -> f32x16 {
@@ -127,25 +113,7 @@ fn gelu_lanes(x: f32x16) -> f32x16 {
     half.mul_add(gelu_gate(x), half)
 }
 
-impl Operation<1> for Gelu {
-    const NAME: &'static str = "gelu";
-
-    fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
-        let mut y = x.values.to_vec();
-        gelu_in_place(&mut y);
-        Ok((y, Shape::from(x.dims)))
-    }
-
-    fn backward(&self, [x]: [Arg<'_>; 1], _: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
-        let mut dx = vec![0.0; dy.len()];
-        let (half, one) = (f32x16::splat(0.5), f32x16::ONE);
-        for ((x, dy), dx) in x.values.chunks(LANES).zip(dy.chunks(LANES)).zip(dx.chunks_mut(LANES)) {
-            let (x, dy) = (load(x), load(dy));
-            let gate = gelu_gate(x);
-            let inner = (x * x).mul_add(f32x16::splat(3.0 * GELU_CUBE), one) * f32x16::splat(GELU_SCALE);
-            let slope = half * (one + gate) + half * x * (one - gate * gate) * inner;
-            store(slope * dy, dx);
-        }
-        Ok([Some(dx)])
-    }
+/// [`gelu`] of plain numbers, with the same bits.
+pub(crate) fn gelu_in_place(x: &mut [f32]) {
+    x.chunks_mut(LANES).for_each(|x| store(gelu_lanes(load(x)), x));
 }

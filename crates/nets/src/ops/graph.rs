@@ -203,10 +203,10 @@ impl Op {
                     let inverse = 1.0 / degree.max(1) as f32;
                     let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
                     let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
-                    for k in 0..width {
-                        message[k] *= inverse;
-                        let own = if self.block.self_path { own[k] } else { 0.0 };
-                        out[k] = (own + message[k]).max(0.0);
+                    for ((message, out), own) in message.iter_mut().zip(out).zip(own) {
+                        *message *= inverse;
+                        let own = if self.block.self_path { *own } else { 0.0 };
+                        *out = (own + *message).max(0.0);
                     }
                 }
             }

@@ -120,26 +120,19 @@ impl Op {
         Ok((all / rows, rows))
     }
 
-    /// Zeros the rows of a tile, in `out`, whose sequences begin with step t. `None` if none does.
-    fn begun<'a>(
-        &self,
-        old: &[f32],
-        t: usize,
-        rows: usize,
-        tile: &Range<usize>,
-        out: &'a mut Vec<f32>,
-    ) -> Option<&'a [f32]> {
+    /// Zeros the rows of a tile, in `to`, whose sequences begin with step t. `None` if none does.
+    fn begun<'a>(&self, h: &[f32], t: usize, r: usize, tile: &Range<usize>, to: &'a mut Vec<f32>) -> Option<&'a [f32]> {
         let hidden = self.sizes.hidden;
-        let firsts = self.firsts.get(t * rows + tile.start..t * rows + tile.end)?;
+        let firsts = self.firsts.get(t * r + tile.start..t * r + tile.end)?;
         if firsts.iter().all(|first| *first == 0) {
             return None;
         }
-        out.clear();
-        out.extend_from_slice(old);
+        to.clear();
+        to.extend_from_slice(h);
         for (row, _) in firsts.iter().enumerate().filter(|(_, first)| **first != 0) {
-            out[row * hidden..(row + 1) * hidden].fill(0.0);
+            to[row * hidden..(row + 1) * hidden].fill(0.0);
         }
-        Some(out)
+        Some(to)
     }
 }
 
@@ -211,13 +204,7 @@ impl Operation<2> for Op {
 
 impl Op {
     /// The gradient of the parameters; writes that of the input to dx.
-    pub(super) fn gradients(
-        &self,
-        [x, p]: [Arg<'_>; 2],
-        states: &[f32],
-        dy: &[f32],
-        dx: &mut [f32],
-    ) -> Result<Vec<f32>> {
+    pub(super) fn gradients(&self, [x, p]: [Arg<'_>; 2], h: &[f32], dy: &[f32], dx: &mut [f32]) -> Result<Vec<f32>> {
         let (steps, rows) = self.steps_and_rows(&x)?;
         let (Sizes { inputs, hidden }, triple, [w_x, b_x, w_h, b_h]) =
             (self.sizes, self.sizes.triple(), self.sizes.ranges());
@@ -235,7 +222,7 @@ impl Op {
             for t in (0..steps).rev() {
                 let before = match t {
                     0 => &self.h0[..],
-                    _ => &states[(t - 1) * rows * hidden..],
+                    _ => &h[(t - 1) * rows * hidden..],
                 };
                 let before = &before[tile.start * hidden..tile.end * hidden];
                 let before = self.begun(before, t, rows, &tile, &mut begun).unwrap_or(before);

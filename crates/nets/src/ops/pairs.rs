@@ -3,29 +3,47 @@
 use super::operation::{Arg, Operation, apply1, apply2};
 use candle_core::{Result, Shape, Tensor, bail};
 
-/// The smaller of two numbers; its gradient goes to that one, in halves if they are equal.
+/// The smaller of two numbers; its gradient goes to that one, in halves if they are equal. NaN if one of them is.
 pub fn minimum(a: &Tensor, b: &Tensor) -> Result<Tensor> {
-    apply2(Pairs::Minimum, [a, b])
+    let value = |a: f32, b: f32| {
+        if a < b {
+            a
+        } else if b <= a {
+            b
+        } else {
+            a + b
+        }
+    };
+    apply2(Pairs { value, slope: chosen, both: true }, [a, b])
 }
 
-/// The larger of two numbers; its gradient goes to that one, in halves if they are equal.
+/// The larger of two numbers, as [`minimum`].
 pub fn maximum(a: &Tensor, b: &Tensor) -> Result<Tensor> {
-    apply2(Pairs::Maximum, [a, b])
+    let value = |a: f32, b: f32| {
+        if a > b {
+            a
+        } else if b >= a {
+            b
+        } else {
+            a + b
+        }
+    };
+    apply2(Pairs { value, slope: chosen, both: true }, [a, b])
 }
 
 /// x + numbers, which have no gradient.
 pub fn plus(x: &Tensor, numbers: &Tensor) -> Result<Tensor> {
-    apply2(Pairs::Plus, [x, numbers])
+    apply2(Pairs { value: |x, number| x + number, slope: |_, _, _| 1.0, both: false }, [x, numbers])
 }
 
 /// x − numbers, which have no gradient.
 pub fn minus(x: &Tensor, numbers: &Tensor) -> Result<Tensor> {
-    apply2(Pairs::Minus, [x, numbers])
+    apply2(Pairs { value: |x, number| x - number, slope: |_, _, _| 1.0, both: false }, [x, numbers])
 }
 
 /// x · numbers, which have no gradient.
 pub fn times(x: &Tensor, numbers: &Tensor) -> Result<Tensor> {
-    apply2(Pairs::Times, [x, numbers])
+    apply2(Pairs { value: |x, number| x * number, slope: |_, number, _| number, both: false }, [x, numbers])
 }
 
 /// Row `index` `[n]` of x [m, n].
@@ -33,74 +51,44 @@ pub fn row(x: &Tensor, index: usize) -> Result<Tensor> {
     apply1(Row(index), x)
 }
 
-enum Pairs {
-    Minimum,
-    Maximum,
-    Plus,
-    Minus,
-    Times,
+/// Half a gradient for each of two equal numbers.
+fn chosen(own: f32, other: f32, y: f32) -> f32 {
+    if own != y {
+        0.0
+    } else if other == y {
+        0.5
+    } else {
+        1.0
+    }
 }
 
-impl Operation<2> for Pairs {
+/// A function of two numbers, its derivative in terms of one, the other and the result, and whether the second has a gradient.
+struct Pairs<V, S> {
+    value: V,
+    slope: S,
+    both: bool,
+}
+
+impl<V, S> Operation<2> for Pairs<V, S>
+where
+    V: Fn(f32, f32) -> f32 + Send + Sync + 'static,
+    S: Fn(f32, f32, f32) -> f32 + Send + Sync + 'static,
+{
     const NAME: &'static str = "pairs";
 
     fn forward(&self, [a, b]: [Arg<'_>; 2]) -> Result<(Vec<f32>, Shape)> {
         if a.dims != b.dims {
             bail!("pairs: shapes {:?} and {:?} differ", a.dims, b.dims);
         }
-        let pairs = a.values.iter().zip(b.values);
-        let y = match self {
-            // A comparison with NaN is false; then the sum is NaN, too.
-            Self::Minimum => pairs
-                .map(|(&a, &b)| {
-                    if a < b {
-                        a
-                    } else if b <= a {
-                        b
-                    } else {
-                        a + b
-                    }
-                })
-                .collect(),
-            Self::Maximum => pairs
-                .map(|(&a, &b)| {
-                    if a > b {
-                        a
-                    } else if b >= a {
-                        b
-                    } else {
-                        a + b
-                    }
-                })
-                .collect(),
-            Self::Plus => pairs.map(|(a, b)| a + b).collect(),
-            Self::Minus => pairs.map(|(a, b)| a - b).collect(),
-            Self::Times => pairs.map(|(a, b)| a * b).collect(),
-        };
-        Ok((y, Shape::from(a.dims)))
+        Ok((a.values.iter().zip(b.values).map(|(a, b)| (self.value)(*a, *b)).collect(), Shape::from(a.dims)))
     }
 
     fn backward(&self, [a, b]: [Arg<'_>; 2], y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 2]> {
-        // Half a gradient for each of two equal numbers.
         let part = |own: &[f32], other: &[f32]| {
             let triples = own.iter().zip(other).zip(y.iter().zip(dy));
-            triples
-                .map(|((o, other), (y, d))| {
-                    if o != y {
-                        0.0
-                    } else if other == y {
-                        0.5 * d
-                    } else {
-                        *d
-                    }
-                })
-                .collect()
+            triples.map(|((own, other), (y, d))| d * (self.slope)(*own, *other, *y)).collect()
         };
-        Ok(match self {
-            Self::Minimum | Self::Maximum => [Some(part(a.values, b.values)), Some(part(b.values, a.values))],
-            Self::Plus | Self::Minus => [Some(dy.to_vec()), None],
-            Self::Times => [Some(b.values.iter().zip(dy).map(|(b, d)| b * d).collect()), None],
-        })
+        Ok([Some(part(a.values, b.values)), self.both.then(|| part(b.values, a.values))])
     }
 }
 

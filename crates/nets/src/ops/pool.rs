@@ -1,4 +1,4 @@
-use super::operation::{Arg, Operation, apply1, apply3};
+use super::operation::{Arg, Operation, apply1};
 use super::simd::{LANES, WIDE, load, store};
 use candle_core::{Result, Shape, Tensor, bail};
 use wide::f32x16;
@@ -52,50 +52,8 @@ impl Operation<1> for MeanOfOthers {
     }
 }
 
-/// Sum over an agent's nearest neighbours of relu(f · w + b): y [R, h] from constant neighbour features f [R, k, c] of
-/// which the first `counts[r]` rows are real. One fused operation: the [R·k, h] intermediate is never stored.
-pub fn neighbour_pool(features: &Tensor, counts: Vec<u8>, w: &Tensor, b: &Tensor) -> Result<Tensor> {
-    apply3(NeighbourPool { counts }, [features, w, b])
-}
-
-struct NeighbourPool {
-    counts: Vec<u8>,
-}
-
-impl Operation<3> for NeighbourPool {
-    const NAME: &'static str = "neighbour-pool";
-
-    fn forward(&self, [features, w, b]: [Arg<'_>; 3]) -> Result<(Vec<f32>, Shape)> {
-        let [rows, neighbours, channels] = *features.dims else {
-            bail!("neighbour pool: features {:?} are not [R, k, c]", features.dims)
-        };
-        let width = w.rows().1;
-        if w.dims != [channels, width] || b.dims != [width] || self.counts.len() != rows {
-            bail!(
-                "neighbour pool: weights {:?}, {} counts and features {:?} do not fit",
-                w.dims,
-                self.counts.len(),
-                features.dims
-            );
-        }
-        let mut y = vec![0.0; rows * width];
-        let weights = PoolWeights::new(w.values, b.values, neighbours * channels);
-        weights.forward(features.values, &self.counts, &mut y, width);
-        Ok((y, Shape::from((rows, width))))
-    }
-
-    fn backward(&self, [features, w, b]: [Arg<'_>; 3], _y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 3]> {
-        let ((channels, width), stride) = (w.rows(), features.rows().1 * features.dims[1]);
-        let weights = PoolWeights::new(w.values, b.values, stride);
-        let mut gradient = PoolGradient::new(&weights);
-        weights.backward(features.values, &self.counts, dy, width, &mut gradient);
-        let (mut dw, mut db) = (vec![0.0; channels * width], vec![0.0; width]);
-        gradient.write(&mut dw, &mut db);
-        Ok([None, Some(dw), Some(db)])
-    }
-}
-
-/// Weights of a pool, cut into columns of two vectors.
+/// Weights of a pool, cut into columns of two vectors: the sum over an agent's nearest neighbours of relu(f · w + b), for constant
+/// features f [R, k, c] of which the first `counts[r]` rows are real. What every neighbour adds is never stored.
 pub(crate) struct PoolWeights {
     /// [h / 32, c + 1] two vectors each; the bias comes last.
     panels: Vec<Vec<Pair>>,
@@ -106,6 +64,24 @@ pub(crate) struct PoolWeights {
 }
 
 type Pair = [f32x16; 2];
+
+/// Runs `$do` for the real neighbours of an agent in their order, R at once: four (where there are registers for them), two and one.
+macro_rules! in_groups {
+    ($features:expr, $count:expr, $channels:expr, |$f:ident, $R:ident| $do:expr) => {{
+        let (mut left, mut rest): (usize, &[f32]) = (usize::from($count), $features);
+        in_groups!(if WIDE { 4 } else { 2 }, left, rest, $channels, |$f, $R| $do);
+        in_groups!(2, left, rest, $channels, |$f, $R| $do);
+        in_groups!(1, left, rest, $channels, |$f, $R| $do);
+    }};
+    ($size:expr, $left:ident, $rest:ident, $channels:expr, |$f:ident, $R:ident| $do:expr) => {{
+        const $R: usize = $size;
+        while $left >= $R {
+            let $f = &$rest[..$R * $channels];
+            $do;
+            ($left, $rest) = ($left - $R, &$rest[$R * $channels..]);
+        }
+    }};
+}
 
 fn pair(row: &[f32], start: usize) -> Pair {
     let at = |start: usize| load(&row[start.min(row.len())..]);
@@ -131,16 +107,15 @@ impl PoolWeights {
 
     /// Writes the pools of all agents into rows of y that are `stride` apart.
     pub(crate) fn forward(&self, features: &[f32], counts: &[u8], y: &mut [f32], stride: usize) {
+        let add = |total: &mut Pair, z: &[Pair]| {
+            for z in z {
+                *total = [total[0] + z[0].fast_max(f32x16::ZERO), total[1] + z[1].fast_max(f32x16::ZERO)];
+            }
+        };
         for (index, panel) in self.panels.iter().enumerate() {
             for ((f, &count), y) in features.chunks_exact(self.stride).zip(counts).zip(y.chunks_mut(stride)) {
                 let mut total = [f32x16::ZERO; 2];
-                self.neighbours(f, count, |f, group| {
-                    group.hidden(f, panel, self.channels, |z| {
-                        for v in 0..2 {
-                            total[v] += z[v].fast_max(f32x16::ZERO);
-                        }
-                    });
-                });
+                in_groups!(f, count, self.channels, |f, R| add(&mut total, &hidden::<R>(f, panel)));
                 put(total, &mut y[..self.width], index * 2 * LANES);
             }
         }
@@ -158,29 +133,7 @@ impl PoolWeights {
         for ((index, panel), sums) in self.panels.iter().enumerate().zip(&mut gradient.panels) {
             for ((f, &count), dy) in features.chunks_exact(self.stride).zip(counts).zip(dy.chunks(stride)) {
                 let dy = pair(&dy[..self.width], index * 2 * LANES);
-                self.neighbours(f, count, |f, group| {
-                    let (mut dz, mut at) = ([[f32x16::ZERO; 2]; 4], 0);
-                    group.hidden(f, panel, self.channels, |z| {
-                        dz[at] = [z[0].simd_gt(f32x16::ZERO) & dy[0], z[1].simd_gt(f32x16::ZERO) & dy[1]];
-                        at += 1;
-                    });
-                    group.gradient(f, self.channels, &dz, sums);
-                });
-            }
-        }
-    }
-
-    /// Calls `f` for the real neighbours of an agent in their order, in groups of four (where there are registers for them), two and
-    /// one.
-    #[inline(always)]
-    fn neighbours(&self, features: &[f32], count: u8, mut f: impl FnMut(&[f32], Group)) {
-        let (mut left, mut features) = (usize::from(count), features);
-        let first = if WIDE { (4, Group::Four) } else { (2, Group::Two) };
-        for (size, group) in [first, (2, Group::Two), (1, Group::One)] {
-            while left >= size {
-                f(&features[..size * self.channels], group);
-                features = &features[size * self.channels..];
-                left -= size;
+                in_groups!(f, count, self.channels, |f, R| learn::<R>(f, panel, dy, sums));
             }
         }
     }
@@ -207,68 +160,34 @@ impl PoolGradient {
     }
 }
 
-/// How many neighbours are in registers at once.
-#[derive(Clone, Copy)]
-enum Group {
-    Four,
-    Two,
-    One,
-}
-
-impl Group {
-    /// Calls `f` with f · w + b of each neighbour in turn.
-    #[inline(always)]
-    fn hidden(self, features: &[f32], panel: &[Pair], channels: usize, f: impl FnMut(Pair)) {
-        match self {
-            Self::Four => hidden4(features, panel, channels, f),
-            Self::Two => hidden2(features, panel, channels, f),
-            Self::One => hidden1(features, panel, channels, f),
+/// f · w + b of R neighbours.
+#[inline(always)]
+fn hidden<const R: usize>(features: &[f32], panel: &[Pair]) -> [Pair; R] {
+    let channels = panel.len() - 1;
+    let rows: [&[f32]; R] = std::array::from_fn(|r| &features[r * channels..][..channels]);
+    let mut z = [panel[channels]; R];
+    for (c, w) in panel[..channels].iter().enumerate() {
+        for (z, row) in z.iter_mut().zip(rows) {
+            let a = f32x16::splat(row[c]);
+            *z = [a.mul_add(w[0], z[0]), a.mul_add(w[1], z[1])];
         }
     }
+    z
+}
 
-    /// Adds the neighbours' features times their dz to the sums.
-    #[inline(always)]
-    fn gradient(self, features: &[f32], channels: usize, dz: &[Pair; 4], sums: &mut [Pair]) {
-        match self {
-            Self::Four => gradient4(features, channels, dz, sums),
-            Self::Two => gradient2(features, channels, dz, sums),
-            Self::One => gradient1(features, channels, dz, sums),
+/// Adds the features of R neighbours times their dz to the sums.
+#[inline(always)]
+fn learn<const R: usize>(features: &[f32], panel: &[Pair], dy: Pair, sums: &mut [Pair]) {
+    let channels = panel.len() - 1;
+    let dz =
+        hidden::<R>(features, panel).map(|z| [z[0].simd_gt(f32x16::ZERO) & dy[0], z[1].simd_gt(f32x16::ZERO) & dy[1]]);
+    let rows: [&[f32]; R] = std::array::from_fn(|r| &features[r * channels..][..channels]);
+    for (c, sum) in sums[..channels].iter_mut().enumerate() {
+        for (dz, row) in dz.iter().zip(rows) {
+            let a = f32x16::splat(row[c]);
+            *sum = [a.mul_add(dz[0], sum[0]), a.mul_add(dz[1], sum[1])];
         }
     }
+    let bias = &mut sums[channels];
+    dz.iter().for_each(|dz| *bias = [bias[0] + dz[0], bias[1] + dz[1]]);
 }
-
-macro_rules! group {
-    ($hidden:ident, $gradient:ident, $size:literal, $($r:literal)*) => {
-        #[inline(always)]
-        fn $hidden(features: &[f32], panel: &[Pair], channels: usize, mut f: impl FnMut(Pair)) {
-            let rows: [&[f32]; $size] = [$(&features[$r * channels..][..channels]),*];
-            let mut z = [panel[channels]; $size];
-            for (c, w) in panel[..channels].iter().enumerate() {
-                $(
-                    let a = f32x16::splat(rows[$r][c]);
-                    z[$r] = [a.mul_add(w[0], z[$r][0]), a.mul_add(w[1], z[$r][1])];
-                )*
-            }
-            $(f(z[$r]);)*
-        }
-
-        #[inline(always)]
-        fn $gradient(features: &[f32], channels: usize, dz: &[Pair; 4], sums: &mut [Pair]) {
-            let rows: [&[f32]; $size] = [$(&features[$r * channels..][..channels]),*];
-            let (sums, rest) = sums.split_at_mut(channels);
-            for (c, sum) in sums.iter_mut().enumerate() {
-                $(
-                    let a = f32x16::splat(rows[$r][c]);
-                    *sum = [a.mul_add(dz[$r][0], sum[0]), a.mul_add(dz[$r][1], sum[1])];
-                )*
-            }
-            if let Some(bias) = rest.first_mut() {
-                $(*bias = [bias[0] + dz[$r][0], bias[1] + dz[$r][1]];)*
-            }
-        }
-    };
-}
-
-group!(hidden1, gradient1, 1, 0);
-group!(hidden2, gradient2, 2, 0 1);
-group!(hidden4, gradient4, 4, 0 1 2 3);

@@ -168,12 +168,44 @@ fn log_densities_of_actions_have_the_bits_of_the_draw() {
     assert!((values[0] + 1.418_938_5).abs() < 1e-6 && (values[1] - 1.418_938_5).abs() < 1e-6);
 }
 
+/// Unlike candle's, constants get no gradient.
 #[test]
-fn neighbour_pool() {
-    let features = Tensor::from_vec(normal(5 * 3 * 4, 1), (5, 3, 4), &Device::Cpu).unwrap();
-    let counts = vec![3, 0, 1, 2, 3];
-    let (w, b) = (var(&[4, 20], 2), var(&[20], 3));
-    check(&[&w, &b], &|| ops::neighbour_pool(&features, counts.clone(), &w, &b).unwrap());
+fn pairs_and_huber_match_candle() {
+    let (x, y) = (var(&[3, 21], 1), var(&[3, 21], 2));
+    // Some are equal: each gets half of the gradient.
+    let shared = Tensor::cat(&[x.narrow(0, 0, 1).unwrap(), y.narrow(0, 1, 2).unwrap()], 0).unwrap();
+    let shared = Var::from_tensor(&shared).unwrap();
+    let pairs: [(fn(&Tensor, &Tensor) -> Tensor, fn(&Tensor, &Tensor) -> Tensor, bool); 5] = [
+        (|a, b| ops::minimum(a, b).unwrap(), |a, b| a.minimum(b).unwrap(), true),
+        (|a, b| ops::maximum(a, b).unwrap(), |a, b| a.maximum(b).unwrap(), true),
+        (|a, b| ops::plus(a, b).unwrap(), |a, b| (a + b).unwrap(), false),
+        (|a, b| ops::minus(a, b).unwrap(), |a, b| (a - b).unwrap(), false),
+        (|a, b| ops::times(a, b).unwrap(), |a, b| (a * b).unwrap(), false),
+    ];
+    let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    for (ours, theirs, both) in pairs {
+        check(&[&x], &|| ours(&x, &y.detach()));
+        let found = [ours, theirs].map(|f| {
+            let z = f(&x, &shared);
+            let store = (&z * y.as_tensor()).unwrap().sum_all().unwrap().backward().unwrap();
+            (numbers(&z), numbers(store.get(&x).unwrap()), store.get(&shared).map(&numbers))
+        });
+        assert_eq!((&found[0].0, &found[0].1), (&found[1].0, &found[1].1));
+        assert!(if both { found[0].2 == found[1].2 } else { found[0].2.is_none() });
+    }
+    assert!(ops::minimum(&x, &y.narrow(0, 0, 2).unwrap()).is_err());
+    let nan = Tensor::full(f32::NAN, (3, 21), &Device::Cpu).unwrap();
+    for z in [ops::minimum(&x, &nan), ops::maximum(&nan, &x), ops::huber(&nan, 0.3)] {
+        assert!(numbers(&z.unwrap()).iter().all(|z| z.is_nan()));
+    }
+    check(&[&x], &|| ops::row(&x, 1).unwrap());
+    assert_eq!(numbers(&ops::row(&x, 2).unwrap()), numbers(&x.get(2).unwrap()));
+    assert!(ops::row(&x, 3).is_err());
+    let size = x.abs().unwrap();
+    let inner = size.clamp(0.0, 0.3).unwrap();
+    let plain = (&inner * (&size - (&inner * 0.5).unwrap()).unwrap()).unwrap();
+    assert_eq!(numbers(&ops::huber(&x, 0.3).unwrap()), numbers(&plain));
+    check(&[&x], &|| ops::huber(&x, 0.3).unwrap());
 }
 
 #[test]

@@ -7,7 +7,7 @@
 
 use crate::strongly_connected::strongly_connected;
 use crate::ties::NONE;
-use crate::{AssignError, UNASSIGNED};
+use crate::{AssignError, GoOn, Result, UNASSIGNED};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -55,13 +55,13 @@ pub(super) fn lowest(
     agents: &[u32],
     goals: &[&[u32]],
     places: [usize; 2],
-    should_continue: &dyn Fn() -> bool,
-) -> Result<Option<Vec<u32>>, AssignError> {
+    go_on: GoOn<'_>,
+) -> Result<Option<Vec<u32>>> {
     let mut choice = Choice::new(arcs, goals, places);
     choice.prune();
     let mut goal_of = Vec::with_capacity(agents.len());
     for &place in agents {
-        if !should_continue() {
+        if !go_on() {
             return Err(AssignError::Interrupted);
         }
         let Some(goal) = choice.choose(place) else {

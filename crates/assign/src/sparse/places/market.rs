@@ -1,12 +1,12 @@
 //! Places with supplies and places with demands: a cheapest flow between them, and the arcs of all cheapest ones.
 
 use super::simplex::{Arc, Simplex, Tree};
-use crate::AssignError;
 use crate::fixed::{Fixed, Scale};
 use crate::sparse::MOST_NEAR;
 use crate::sparse::candidates::Candidates;
 use crate::sparse::points::Points;
 use crate::ties;
+use crate::{AssignError, GoOn, Result};
 
 /// Pairs of places up to which all of them are arcs from the beginning.
 const FEW: usize = 1 << 18;
@@ -37,11 +37,11 @@ pub(super) struct Flows {
 impl<const D: usize> Market<D> {
     /// A cheapest flow in exact arithmetic and the arcs of all of them; where there are too many, a flow that is cheapest as
     /// far as doubles can tell, and its own arcs. Nothing if doubles are not enough to find one.
-    pub(super) fn solve(&mut self, should_continue: &dyn Fn() -> bool) -> Result<Option<Flows>, AssignError> {
-        let Some((simplex, penalty)) = self.rounded(should_continue)? else {
+    pub(super) fn solve(&mut self, go_on: GoOn<'_>) -> Result<Option<Flows>> {
+        let Some((simplex, penalty)) = self.rounded(go_on)? else {
             return Ok(None);
         };
-        let Some(near) = self.near(&simplex, should_continue)? else {
+        let Some(near) = self.near(&simplex, go_on)? else {
             return Ok(Some(Flows { arcs: flowing(&simplex.tree) }));
         };
         let (mut scale, mut switches) = (Scale::default(), 0usize);
@@ -56,11 +56,11 @@ impl<const D: usize> Market<D> {
         let bits = scale.bits() + switches + 1 + (usize::BITS - simplex.value.len().leading_zeros()) + 2 + 1;
         let input = Input { near: &near, penalty, unit: scale.unit(), switches };
         match bits {
-            ..=128 => self.exact::<2>(&input, simplex.tree, should_continue),
-            129..=256 => self.exact::<4>(&input, simplex.tree, should_continue),
-            257..=640 => self.exact::<10>(&input, simplex.tree, should_continue),
+            ..=128 => self.exact::<2>(&input, simplex.tree, go_on),
+            129..=256 => self.exact::<4>(&input, simplex.tree, go_on),
+            257..=640 => self.exact::<10>(&input, simplex.tree, go_on),
             // All doubles there are.
-            _ => self.exact::<36>(&input, simplex.tree, should_continue),
+            _ => self.exact::<36>(&input, simplex.tree, go_on),
         }
     }
 
@@ -79,19 +79,16 @@ impl<const D: usize> Market<D> {
     }
 
     /// A cheapest flow in doubles, and the penalty that it was found with.
-    pub(super) fn rounded(
-        &mut self,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Option<(Simplex<f64>, f64)>, AssignError> {
+    pub(super) fn rounded(&mut self, go_on: GoOn<'_>) -> Result<Option<(Simplex<f64>, f64)>> {
         let mut penalty = if self.magnitude > 0.0 { 2.0 * self.magnitude } else { 1.0 };
         let most = penalty * 16.0 * (self.supply.len() + self.demand.len()) as f64;
         let mut simplex = Simplex::new(&self.supply, &self.demand, penalty);
         let tolerance = |penalty: f64| penalty / (1u64 << 44) as f64;
         simplex.tolerance = tolerance(penalty);
-        self.first_arcs(&mut simplex.arcs, should_continue)?;
+        self.first_arcs(&mut simplex.arcs, go_on)?;
         loop {
-            simplex.run(|tolerance| 4.0 * tolerance, should_continue)?;
-            if self.add_cheaper(&mut simplex, should_continue)? {
+            simplex.run(|tolerance| 4.0 * tolerance, go_on)?;
+            if self.add_cheaper(&mut simplex, go_on)? {
                 continue;
             }
             if !simplex.tree.unserved() {
@@ -108,13 +105,13 @@ impl<const D: usize> Market<D> {
     }
 
     /// The arcs to begin with.
-    fn first_arcs(&mut self, arcs: &mut Vec<Arc<f64>>, should_continue: &dyn Fn() -> bool) -> Result<(), AssignError> {
+    fn first_arcs(&mut self, arcs: &mut Vec<Arc<f64>>, go_on: GoOn<'_>) -> Result<()> {
         let (rows, cols) = (self.source.rows() as u32, self.source.cols() as u32);
         let all = self.supply.len() * self.demand.len() <= FEW;
         let price = vec![0.0; cols as usize];
         let mut found = Vec::new();
         for row in 0..self.supply.len() as u32 {
-            if row % 1024 == 0 && !should_continue() {
+            if row % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             if all || row >= rows {
@@ -130,11 +127,7 @@ impl<const D: usize> Market<D> {
     }
 
     /// Adds pairs that are cheaper than their values; whether there are any.
-    fn add_cheaper(
-        &mut self,
-        simplex: &mut Simplex<f64>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<bool, AssignError> {
+    fn add_cheaper(&mut self, simplex: &mut Simplex<f64>, go_on: GoOn<'_>) -> Result<bool> {
         if self.supply.len() * self.demand.len() <= FEW {
             return Ok(false);
         }
@@ -143,7 +136,7 @@ impl<const D: usize> Market<D> {
         let before = simplex.arcs.len();
         let mut found = Vec::new();
         for row in 0..self.source.rows() as u32 {
-            if row % 1024 == 0 && !should_continue() {
+            if row % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             self.source.nearest(row, CHEAPER, price, &mut found);
@@ -155,11 +148,7 @@ impl<const D: usize> Market<D> {
     }
 
     /// The nearly tight pairs (see [`crate::ties`]), those of the tree among them; nothing if there are too many.
-    fn near(
-        &mut self,
-        simplex: &Simplex<f64>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Option<Vec<(u32, u32)>>, AssignError> {
+    fn near(&mut self, simplex: &Simplex<f64>, go_on: GoOn<'_>) -> Result<Option<Vec<(u32, u32)>>> {
         let (rows, cols) = (self.supply.len(), self.demand.len());
         let magnitude = |values: &[f64]| values.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
         let (row_value, col_value) = simplex.value.split_at(rows);
@@ -174,7 +163,7 @@ impl<const D: usize> Market<D> {
         loop {
             let (mut near, mut found, mut beaten) = (Vec::new(), Vec::new(), 0.0);
             for (row, &own) in (0u32..).zip(row_value) {
-                if row % 1024 == 0 && !should_continue() {
+                if row % 1024 == 0 && !go_on() {
                     return Err(AssignError::Interrupted);
                 }
                 found.clear();
@@ -203,12 +192,7 @@ impl<const D: usize> Market<D> {
     }
 
     /// Goes on from the tree of the rounded solution without rounding.
-    fn exact<const N: usize>(
-        &self,
-        input: &Input<'_>,
-        tree: Tree,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<Option<Flows>, AssignError> {
+    fn exact<const N: usize>(&self, input: &Input<'_>, tree: Tree, go_on: GoOn<'_>) -> Result<Option<Flows>> {
         let of = |value: f64| Fixed::<N>::of(value, input.unit).shifted(input.switches);
         let cost = |row: u32, col: u32| {
             let ([first, second], current) = self.terms(row, col);
@@ -223,7 +207,7 @@ impl<const D: usize> Market<D> {
         let of_tree = of_tree.collect();
         let arcs = input.near.iter().map(|&(row, col)| Arc { row, col, cost: cost(row, col) }).collect();
         let mut simplex = Simplex::of(tree, of_tree, arcs);
-        simplex.run(|none| none, should_continue)?;
+        simplex.run(|none| none, go_on)?;
         let Simplex { tree, value, arcs, .. } = simplex;
         if tree.unserved() {
             return Ok(None);

@@ -1,10 +1,10 @@
 //! A largest matching of places up to a threshold, for the bottleneck: rows have shares of columns.
 
 use super::{Counted, Places};
-use crate::AssignError;
 use crate::sparse::NONE;
 use crate::sparse::costs::Metric;
 use crate::sparse::growing::{Growing, Seeker};
+use crate::{AssignError, GoOn, Result};
 
 /// The side of more places are the rows: ways are found sooner from many places to few.
 pub(in crate::sparse) struct Shares<const D: usize> {
@@ -145,7 +145,7 @@ impl<const D: usize> Growing<D> for Shares<D> {
         &mut self.reached
     }
 
-    fn grow(&mut self, limit: f64, should_continue: &dyn Fn() -> bool) -> Result<usize, AssignError> {
+    fn grow(&mut self, limit: f64, go_on: GoOn<'_>) -> Result<usize> {
         self.drop_dearer(limit);
         let mut way = Vec::new();
         loop {
@@ -158,7 +158,7 @@ impl<const D: usize> Growing<D> for Shares<D> {
             self.round += 1;
             let before: usize = self.left_over.iter().sum();
             for row in 0..self.left_over.len() as u32 {
-                if row % 1024 == 0 && !should_continue() {
+                if row % 1024 == 0 && !go_on() {
                     return Err(AssignError::Interrupted);
                 }
                 while self.left_over[row as usize] > 0 && self.met[row as usize] != self.round {

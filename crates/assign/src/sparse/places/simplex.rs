@@ -7,9 +7,9 @@
 //!
 //! The numbers are doubles, or whole numbers without rounding ([`Fixed`]); both go on from the same tree.
 
-use crate::AssignError;
 use crate::fixed::Fixed;
 use crate::ties::NONE;
+use crate::{AssignError, GoOn, Result};
 
 /// Arcs and nodes between two questions whether to go on.
 const LOOKS: usize = 1 << 18;
@@ -255,15 +255,11 @@ impl<T: Number> Simplex<T> {
 
     /// Makes the flow a cheapest one of these arcs. Rounding could let doubles go round in circles all the same, so what moves no
     /// flow for long must be better by more: `slacken` gives the next tolerance.
-    pub(super) fn run(
-        &mut self,
-        slacken: impl Fn(T) -> T,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    pub(super) fn run(&mut self, slacken: impl Fn(T) -> T, go_on: GoOn<'_>) -> Result<()> {
         let patience = 16 * self.arcs.len() + 1000;
         while let Some(arc) = self.cheaper() {
             if self.looked > LOOKS {
-                if !should_continue() {
+                if !go_on() {
                     return Err(AssignError::Interrupted);
                 }
                 self.looked = 0;

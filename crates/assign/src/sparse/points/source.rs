@@ -1,10 +1,10 @@
 //! Points as the solver's rows and columns.
 
-use crate::AssignError;
 use crate::sparse::Order;
 use crate::sparse::candidates::Candidates;
 use crate::sparse::costs::{Metric, OwnCost, OwnCosts};
 use crate::sparse::tree::{Found, Tree};
+use crate::{AssignError, GoOn, Result};
 
 /// The solver's rows and columns, in the order of their trees.
 pub(in crate::sparse) struct Points<const D: usize> {
@@ -132,13 +132,7 @@ impl<const D: usize> Candidates for Points<D> {
         Some(Self::new(&from, &to, metric, &OwnCosts::default(), self.largest_cost, None).0)
     }
 
-    fn spread(
-        &mut self,
-        sample: &Self,
-        least: &[f64],
-        price: &mut Vec<f64>,
-        should_continue: &dyn Fn() -> bool,
-    ) -> Result<(), AssignError> {
+    fn spread(&mut self, sample: &Self, least: &[f64], price: &mut Vec<f64>, go_on: GoOn<'_>) -> Result<()> {
         // The sample's rows take the place of columns.
         let (mut tree, order) = Tree::new(&sample.from);
         let least: Vec<f64> = order.iter().map(|&row| least[row as usize]).collect();
@@ -146,7 +140,7 @@ impl<const D: usize> Candidates for Points<D> {
         let mut found = Vec::new();
         price.clear();
         for (place, to) in self.tree.points().iter().enumerate() {
-            if place % 1024 == 0 && !should_continue() {
+            if place % 1024 == 0 && !go_on() {
                 return Err(AssignError::Interrupted);
             }
             tree.nearest(to, 1, false, &sample.metric, &least, &mut found);
