@@ -175,7 +175,8 @@ fn pairs_and_huber_match_candle() {
     // Some are equal: each gets half of the gradient.
     let shared = Tensor::cat(&[x.narrow(0, 0, 1).unwrap(), y.narrow(0, 1, 2).unwrap()], 0).unwrap();
     let shared = Var::from_tensor(&shared).unwrap();
-    let pairs: [(fn(&Tensor, &Tensor) -> Tensor, fn(&Tensor, &Tensor) -> Tensor, bool); 5] = [
+    type Pair = fn(&Tensor, &Tensor) -> Tensor;
+    let pairs: [(Pair, Pair, bool); 5] = [
         (|a, b| ops::minimum(a, b).unwrap(), |a, b| a.minimum(b).unwrap(), true),
         (|a, b| ops::maximum(a, b).unwrap(), |a, b| a.maximum(b).unwrap(), true),
         (|a, b| ops::plus(a, b).unwrap(), |a, b| (a + b).unwrap(), false),
