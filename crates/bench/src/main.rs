@@ -27,10 +27,6 @@ mod vitals;
 use std::path::Path;
 use std::process::ExitCode;
 
-// As in `magex`.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 fn main() -> ExitCode {
     // Before anything else: this may replace the process.
     if let Err(error) = magex_runtime::process::ensure_environment() {
