@@ -3,7 +3,7 @@ mod gradients;
 use super::buffer::Buffer;
 use super::matmul::{Activation, Packed, Rows, Start, layer};
 use super::operation::{Arg, Operation, apply3};
-use super::simd::{LANES, ln_of_normal, load, store, sum, transpose};
+use super::simd::{LANES, ln_of_normal, sum, transpose};
 use candle_core::{Result, Shape, Tensor, bail};
 use std::sync::{Arc, OnceLock};
 use wide::f32x16;
@@ -110,104 +110,128 @@ impl Op {
         transpose(Rows::new(rows, p), n, p, receiver, *padded);
     }
 
-    /// Logits plus noise of agent i towards all others, sixteen neighbours at a time.
+    /// Logits [A, padded] of A agents from i on towards all others, sixteen neighbours at a time. Several vectors at once
+    /// hide the latency of the multiply-adds; each lane's sum has the same order either way.
     #[inline(always)]
-    fn row_logits(&self, state: usize, i: usize, score: &[f32], scratch: &Scratch, logits: &mut [f32]) {
-        // Several vectors at once hide the latency of the multiply-adds; each lane's sum has the same order either way.
+    fn row_logits<const A: usize>(&self, i: usize, score: &[f32], scratch: &Scratch, logits: [&mut [f32]; A]) {
+        let mut logits = logits;
         let mut v = 0;
-        while v + 4 * LANES <= scratch.padded {
-            self.logits_of::<4>(state, i, v, score, scratch, logits);
-            v += 4 * LANES;
-        }
         while v < scratch.padded {
-            self.logits_of::<1>(state, i, v, score, scratch, logits);
-            v += LANES;
+            if v + 4 * LANES <= scratch.padded {
+                self.logits_of::<A, 4>(i, v, score, scratch, &mut logits);
+                v += 4 * LANES;
+            } else {
+                self.logits_of::<A, 1>(i, v, score, scratch, &mut logits);
+                v += LANES;
+            }
         }
     }
 
     #[inline(always)]
-    fn logits_of<const Q: usize>(
+    fn logits_of<const A: usize, const Q: usize>(
         &self,
-        state: usize,
         i: usize,
         v: usize,
         score: &[f32],
         scratch: &Scratch,
-        logits: &mut [f32],
+        logits: &mut [&mut [f32]; A],
     ) {
-        let (n, p, padded) = (self.block.agents, self.block.pair_hidden, scratch.padded);
-        let sender = &scratch.sender[i * p..(i + 1) * p];
-        let mut acc = [f32x16::splat(score[p]); Q];
-        for k in 0..p {
-            let (u, w) = (f32x16::splat(sender[k]), f32x16::splat(score[k]));
-            let receiver = &scratch.receiver[k * padded + v..k * padded + v + Q * LANES];
-            for (q, acc) in acc.iter_mut().enumerate() {
-                let hidden = u + load(&receiver[q * LANES..]);
-                *acc = w.mul_add(hidden.fast_max(f32x16::ZERO), *acc);
+        let (p, padded) = (self.block.pair_hidden, scratch.padded);
+        let senders: [&[f32]; A] = std::array::from_fn(|a| &scratch.sender[(i + a) * p..][..p]);
+        let mut acc = [[f32x16::splat(score[p]); Q]; A];
+        for (k, (receiver, w)) in scratch.receiver.chunks_exact(padded).zip(&score[..p]).enumerate() {
+            let w = f32x16::splat(*w);
+            let receiver = vectors::<Q>(&receiver[v..]);
+            for (acc, sender) in acc.iter_mut().zip(senders) {
+                let u = f32x16::splat(sender[k]);
+                for (acc, receiver) in acc.iter_mut().zip(receiver) {
+                    *acc = w.mul_add((u + receiver).fast_max(f32x16::ZERO), *acc);
+                }
             }
         }
-        for (q, mut acc) in acc.into_iter().enumerate() {
-            let at = v + q * LANES;
-            if let GraphNoise::Keyed(keys) = &self.noise {
-                let counter = (self.block.block << 27).wrapping_add((i * n + at) as u32);
-                acc += logistic(keys[state], counter);
+        for (acc, logits) in acc.into_iter().zip(logits) {
+            for (acc, logits) in acc.into_iter().zip(logits[v..].as_chunks_mut().0) {
+                *logits = acc.to_array();
             }
-            store(acc, &mut logits[at..]);
+        }
+    }
+
+    /// Adds noise to the logits of agent i.
+    #[inline(always)]
+    fn add_noise(&self, state: usize, i: usize, logits: &mut [f32]) {
+        if let GraphNoise::Keyed(keys) = &self.noise {
+            let (key, first) = (keys[state], (self.block.block << 27).wrapping_add((i * self.block.agents) as u32));
+            for (v, logits) in (0..).zip(logits.as_chunks_mut().0) {
+                let noise = logistic(key, first.wrapping_add(LANES as u32 * v));
+                *logits = (f32x16::new(*logits) + noise).to_array();
+            }
         }
     }
 
     /// Edges of agent i as ones and zeros [padded]. Returns the degree.
     #[inline(always)]
     fn edges(&self, i: usize, logits: &[f32], edges: &mut [f32]) -> usize {
-        let n = self.block.agents;
-        for v in (0..logits.len()).step_by(LANES) {
-            store(load(&logits[v..]).simd_gt(f32x16::ZERO) & f32x16::ONE, &mut edges[v..]);
-        }
-        // Neither an agent itself nor what fills up the last vector is a neighbour.
-        edges[i] = 0.0;
-        edges[n..].fill(0.0);
         let mut degree = f32x16::ZERO;
-        for v in (0..edges.len()).step_by(LANES) {
-            degree += load(&edges[v..]);
+        for ((logits, edges), others) in logits.as_chunks().0.iter().zip(edges.as_chunks_mut().0).zip(self.others(i)) {
+            let there = f32x16::new(*logits).simd_gt(f32x16::ZERO) & others & f32x16::ONE;
+            degree += there;
+            *edges = there.to_array();
         }
         sum(degree) as usize
+    }
+
+    /// Masks of the agents other than agent i: neither it nor what fills up the last vector is a neighbour.
+    #[inline(always)]
+    fn others(&self, i: usize) -> impl Iterator<Item = f32x16> {
+        // Not one number written behind the vectors: to read it back with its neighbours takes longer than the whole row.
+        let (i, n) = (f32x16::splat(i as f32), f32x16::splat(self.block.agents as f32));
+        let lanes = f32x16::new(std::array::from_fn(|lane| lane as f32));
+        (0..).step_by(LANES).map(move |v: usize| {
+            let at = lanes + f32x16::splat(v as f32);
+            at.simd_ne(i) & at.simd_lt(n)
+        })
     }
 
     fn aggregate(&self, features: &[f32], relative: &[f32], score: &[f32]) -> Vec<f32> {
         let (n, columns, width, p) = (self.block.agents, self.columns(), self.block.width, self.block.pair_hidden);
         let states = features.len() / (n * columns);
-        let mut y = vec![0.0; states * n * width];
-        let mut scratch = self.scratch();
+        // Grown row by row: a vector of zeros would be written twice.
+        let mut y = Vec::with_capacity(states * n * width);
+        let (mut scratch, mut z) = (self.scratch(), Packed::room(n, width));
         let padded = scratch.padded;
-        let kept = if self.keep { states * n } else { 1 };
-        let (mut logits, mut messages) =
-            (Buffer::take(kept * padded), Buffer::take(if self.keep { kept } else { TILE } * width));
+        let kept = if self.keep { states * n } else { TILE };
+        let (mut logits, mut messages) = (Buffer::take(kept * padded), Buffer::take(kept * width));
         let (mut edges, mut degrees) = (Buffer::take(TILE * padded), [0; TILE]);
         for s in 0..states {
             let features = &features[s * n * columns..(s + 1) * n * columns];
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
             // The sum over the neighbours is a product of ones and zeros with z: the same sums in the same order as one by one.
-            let z = Packed::of_rows(Rows::new(features, columns).skip(2 * p), n, width);
+            z.fill(Rows::new(features, columns).skip(2 * p));
             for first in (0..n).step_by(TILE) {
                 let rows = TILE.min(n - first);
-                for (row, i) in (first..first + rows).enumerate() {
-                    let at = if self.keep { s * n + i } else { 0 };
-                    let logits = &mut logits[at * padded..(at + 1) * padded];
-                    self.row_logits(s, i, score, &scratch, logits);
-                    degrees[row] = self.edges(i, logits, &mut edges[row * padded..(row + 1) * padded]);
-                }
                 let at = if self.keep { s * n + first } else { 0 };
+                let logits = &mut logits[at * padded..(at + rows) * padded];
+                for (i, logits) in (first..).step_by(2).zip(logits.chunks_mut(2 * padded)) {
+                    match logits.split_at_mut(padded) {
+                        (one, []) => self.row_logits(i, score, &scratch, [one]),
+                        (one, two) => self.row_logits(i, score, &scratch, [one, two]),
+                    }
+                }
+                let pairs = logits.chunks_exact_mut(padded).zip(edges.chunks_exact_mut(padded));
+                for ((i, (logits, edges)), degree) in (first..).zip(pairs).zip(&mut degrees) {
+                    self.add_noise(s, i, logits);
+                    *degree = self.edges(i, logits, edges);
+                }
                 let messages = &mut messages[at * width..(at + rows) * width];
                 layer(Rows::new(&edges, padded), &z, Start::Zero, Activation::Identity, messages, width, rows);
                 for ((i, message), degree) in (first..).zip(messages.chunks_exact_mut(width)).zip(degrees) {
                     let inverse = 1.0 / degree.max(1) as f32;
                     let own = &features[i * columns + 2 * p + width..(i + 1) * columns];
-                    let out = &mut y[(s * n + i) * width..(s * n + i + 1) * width];
-                    for ((message, out), own) in message.iter_mut().zip(out).zip(own) {
-                        *message *= inverse;
+                    message.iter_mut().for_each(|message| *message *= inverse);
+                    y.extend(message.iter().zip(own).map(|(message, own)| {
                         let own = if self.block.self_path { *own } else { 0.0 };
-                        *out = (own + *message).max(0.0);
-                    }
+                        (own + message).max(0.0)
+                    }));
                 }
             }
         }
@@ -217,6 +241,12 @@ impl Op {
         }
         y
     }
+}
+
+/// The first Q vectors.
+#[inline(always)]
+fn vectors<const Q: usize>(from: &[f32]) -> [f32x16; Q] {
+    from.as_chunks().0.first_chunk().map_or([f32x16::ZERO; Q], |all: &[_; Q]| all.map(f32x16::new))
 }
 
 /// Sixteen logistic numbers for counters `counter..counter + 16`.

@@ -9,7 +9,7 @@
 //! in memory when it unrolls a loop over more than sixteen of them too late.
 
 pub(crate) use super::simd::Rows;
-use super::simd::{LANES, WIDE, load, store, tanh};
+use super::simd::{LANES, WIDE, load, store, tanh, transpose};
 use wide::f32x16;
 
 /// What is applied to a layer's output.
@@ -51,44 +51,57 @@ impl Packed {
         Self::of(w, rows, columns, PANEL)
     }
 
-    /// From `count` rows of `columns` numbers that are apart.
-    pub(crate) fn of_rows(rows: Rows<'_>, count: usize, columns: usize) -> Self {
-        Self::cut(rows, count, columns, PANEL)
-    }
-
     /// With panels of up to `most` vectors: one, two or four.
     fn of(w: &[f32], rows: usize, columns: usize, most: usize) -> Self {
-        Self::cut(Rows::new(w, columns), rows, columns, most)
-    }
-
-    fn cut(w: Rows<'_>, rows: usize, columns: usize, most: usize) -> Self {
-        let mut panels = Vec::new();
-        let mut start = 0;
-        while start < columns {
-            let left = (columns - start).div_ceil(LANES);
-            let q = if left >= 4 { 4 } else { left.min(2) }.min(most);
-            let mut panel = Vec::with_capacity(rows * q);
-            for row in w.values.chunks(w.stride).take(rows) {
-                for v in 0..q {
-                    let at = (start + v * LANES).min(columns);
-                    panel.push(load(&row[at..columns]));
-                }
-            }
-            panels.push((q, panel));
-            start += q * LANES;
-        }
-        Self { panels, rows, columns }
+        let mut packed = Self::zeros(rows, columns, most);
+        packed.fill(Rows::new(w, columns));
+        packed
     }
 
     /// From the transpose of row-major [rows, columns]: a [columns, rows] matrix.
     pub(crate) fn transposed(w: &[f32], rows: usize, columns: usize) -> Self {
-        let mut t = vec![0.0; rows * columns];
-        for i in 0..rows {
-            for j in 0..columns {
-                t[j * rows + i] = w[i * columns + j];
-            }
+        let mut packed = Self::room(columns, rows);
+        packed.fill_transposed(Rows::new(w, columns));
+        packed
+    }
+
+    /// Room for a [rows, columns] matrix, zero.
+    pub(crate) fn room(rows: usize, columns: usize) -> Self {
+        Self::zeros(rows, columns, PANEL)
+    }
+
+    fn zeros(rows: usize, columns: usize, most: usize) -> Self {
+        let mut panels = Vec::new();
+        let mut left = columns.div_ceil(LANES);
+        while left > 0 {
+            let q = if left >= 4 { 4 } else { left.min(2) }.min(most);
+            panels.push((q, vec![f32x16::ZERO; rows * q]));
+            left -= q;
         }
-        Self::new(&t, columns, rows)
+        Self { panels, rows, columns }
+    }
+
+    /// Takes in rows of the matrix.
+    pub(crate) fn fill(&mut self, w: Rows<'_>) {
+        let mut at = 0;
+        for (q, panel) in &mut self.panels {
+            for (vectors, row) in panel.chunks_exact_mut(*q).zip(w.values.chunks(w.stride)) {
+                let row = &row[at..self.columns];
+                vectors.iter_mut().zip(row.chunks(LANES)).for_each(|(vector, row)| *vector = load(row));
+            }
+            at += *q * LANES;
+        }
+    }
+
+    /// Takes in columns of the matrix, which stand in rows.
+    pub(crate) fn fill_transposed(&mut self, w: Rows<'_>) {
+        let mut at = 0;
+        for (q, panel) in &mut self.panels {
+            let width = *q * LANES;
+            let numbers = wide::bytemuck::cast_slice_mut(panel);
+            transpose(w.skip(at * w.stride), width.min(self.columns - at), self.rows, numbers, width);
+            at += width;
+        }
     }
 }
 

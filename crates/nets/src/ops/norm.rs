@@ -30,7 +30,9 @@ pub(crate) fn normalise(x: &[f32], scale: &[f32], shift: &[f32], y: &mut [f32]) 
         for ((x, out), (scale, shift)) in x.iter().zip(out).zip(scale.iter().zip(shift)) {
             *out = normal(f32x16::new(*x), f32x16::new(*scale), f32x16::new(*shift)).to_array();
         }
-        store(normal(load(x_rest), load(scale_rest), load(shift_rest)), out_rest);
+        if !x_rest.is_empty() {
+            store(normal(load(x_rest), load(scale_rest), load(shift_rest)), out_rest);
+        }
     }
 }
 
@@ -45,28 +47,29 @@ fn moments(row: &[f32]) -> (f32, f32) {
     let (mut total, mut square) = (f32x16::ZERO, f32x16::ZERO);
     let (whole, rest) = row.as_chunks::<LANES>();
     whole.iter().for_each(|chunk| total += f32x16::new(*chunk));
-    let mean = sum(total + load(rest)) / n;
+    if !rest.is_empty() {
+        total += load(rest);
+    }
+    let mean = sum(total) / n;
     for chunk in whole {
         let gap = f32x16::new(*chunk) - f32x16::splat(mean);
         square = gap.mul_add(gap, square);
     }
-    let gap = centred(rest, mean);
-    square = gap.mul_add(gap, square);
+    if !rest.is_empty() {
+        let gap = centred(rest, mean);
+        square = gap.mul_add(gap, square);
+    }
     (mean, 1.0 / (sum(square) / n + EPSILON).sqrt())
 }
 
-/// x − mean; lanes beyond the end of the row are zero.
+/// x − mean of less than a vector; lanes beyond the end of the row are zero.
 #[inline(always)]
-fn centred(chunk: &[f32], mean: f32) -> f32x16 {
-    if chunk.len() == LANES {
-        load(chunk) - f32x16::splat(mean)
-    } else {
-        let mut lanes = [0.0; LANES];
-        for (lane, x) in lanes.iter_mut().zip(chunk) {
-            *lane = x - mean;
-        }
-        f32x16::new(lanes)
+fn centred(rest: &[f32], mean: f32) -> f32x16 {
+    let mut lanes = [0.0; LANES];
+    for (lane, x) in lanes.iter_mut().zip(rest) {
+        *lane = x - mean;
     }
+    f32x16::new(lanes)
 }
 
 impl Operation<3> for LayerNorm {
@@ -109,27 +112,37 @@ impl NormGradient {
     /// Takes in rows x [rows, n] and dy; writes dx in rows that are `stride` apart.
     pub(crate) fn add(&mut self, x: &[f32], gains: &[f32], dy: Rows<'_>, dx: &mut [f32], stride: usize) {
         let n = gains.len();
-        let vectors = n.div_ceil(LANES);
+        let (gains, gains_rest) = gains.as_chunks::<LANES>();
         for ((row, dy), dx) in x.chunks_exact(n).zip(dy.values.chunks(dy.stride)).zip(dx.chunks_mut(stride)) {
             let (mean, inverse) = moments(row);
             let spread = f32x16::splat(inverse);
             let (mut a, mut b) = (f32x16::ZERO, f32x16::ZERO);
-            for v in 0..vectors {
-                let (from, to) = (v * LANES, n.min((v + 1) * LANES));
-                let normal = centred(&row[from..to], mean) * spread;
-                let d = load(&dy[from..to]);
-                let g = d * load(&gains[from..to]);
+            let mut sums = self.scale.iter_mut().zip(&mut self.shift);
+            let mut take = |normal: f32x16, d: f32x16, gain: f32x16| {
+                let g = d * gain;
                 a += g;
                 b = g.mul_add(normal, b);
-                self.scale[v] = d.mul_add(normal, self.scale[v]);
-                self.shift[v] += d;
+                if let Some((scale, shift)) = sums.next() {
+                    *scale = d.mul_add(normal, *scale);
+                    *shift += d;
+                }
+            };
+            let ((row, row_rest), (dy, dy_rest)) = (row.as_chunks::<LANES>(), dy[..n].as_chunks::<LANES>());
+            let normal = |row: &[f32; LANES]| (f32x16::new(*row) - f32x16::splat(mean)) * spread;
+            for ((row, dy), gain) in row.iter().zip(dy).zip(gains) {
+                take(normal(row), f32x16::new(*dy), f32x16::new(*gain));
+            }
+            if !row_rest.is_empty() {
+                take(centred(row_rest, mean) * spread, load(dy_rest), load(gains_rest));
             }
             let (a, b) = (f32x16::splat(sum(a) / n as f32), f32x16::splat(sum(b) / n as f32));
-            for v in 0..vectors {
-                let (from, to) = (v * LANES, n.min((v + 1) * LANES));
-                let normal = centred(&row[from..to], mean) * spread;
-                let g = load(&dy[from..to]) * load(&gains[from..to]);
-                store(spread * (g - a - normal * b), &mut dx[from..to]);
+            let give = |normal: f32x16, d: f32x16, gain: f32x16| spread * (d * gain - a - normal * b);
+            let (dx, dx_rest) = dx[..n].as_chunks_mut::<LANES>();
+            for (((row, dy), gain), dx) in row.iter().zip(dy).zip(gains).zip(dx) {
+                *dx = give(normal(row), f32x16::new(*dy), f32x16::new(*gain)).to_array();
+            }
+            if !row_rest.is_empty() {
+                store(give(centred(row_rest, mean) * spread, load(dy_rest), load(gains_rest)), dx_rest);
             }
         }
     }

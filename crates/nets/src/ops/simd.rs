@@ -100,17 +100,20 @@ pub(crate) fn sums(values: &[f32x16], out: &mut [f32]) {
     out_rest.iter_mut().zip(rest).for_each(|(out, value)| *out = sum(*value));
 }
 
-/// out [columns, stride] gets the transpose of the first `rows` rows and `columns` columns of x; what is beyond them stays.
+/// out [columns, stride] gets the transpose of the first `rows` rows and `columns` columns of x. Where there is room, zeros fill up the
+/// last eight rows; what is beyond them stays.
 #[inline(always)]
 pub(crate) fn transpose(x: Rows<'_>, rows: usize, columns: usize, out: &mut [f32], stride: usize) {
-    let (whole_rows, whole_columns) = (rows / 8 * 8, columns / 8 * 8);
+    let blocks = if rows.next_multiple_of(8) <= stride { rows.div_ceil(8) } else { rows / 8 };
+    let (whole_rows, whole_columns) = (8 * blocks, columns / 8 * 8);
     for row in (0..whole_rows).step_by(8) {
         for column in (0..whole_columns).step_by(8) {
             let line = |i: usize| {
-                let from = x.values.get((row + i) * x.stride + column..).and_then(|from| from.first_chunk());
-                from.map_or(f32x8::ZERO, |from| f32x8::new(*from))
+                let from = if row + i < rows { x.values.get((row + i) * x.stride + column..) } else { None };
+                from.and_then(|from| from.first_chunk()).map_or(f32x8::ZERO, |from| f32x8::new(*from))
             };
-            let block = f32x8::transpose(std::array::from_fn(line));
+            // Written out: the compiler makes a call of `from_fn`.
+            let block = f32x8::transpose([0, 1, 2, 3, 4, 5, 6, 7].map(line));
             for (i, line) in block.into_iter().enumerate() {
                 let at = (column + i) * stride + row;
                 out[at..at + 8].copy_from_slice(&line.to_array());
@@ -210,7 +213,17 @@ mod tests {
         transpose(Rows::new(&numbers, 29), 21, 27, &mut turned, 24);
         for column in 0..27 {
             for row in 0..24 {
-                let expected = if row < 21 { numbers[row * 29 + column] } else { -1.0 };
+                let expected = match row {
+                    0..21 => numbers[row * 29 + column],
+                    // Zeros fill up eight rows, in whole blocks of columns.
+                    _ => {
+                        if column < 24 {
+                            0.0
+                        } else {
+                            -1.0
+                        }
+                    }
+                };
                 assert_eq!(turned[column * 24 + row], expected);
             }
         }
