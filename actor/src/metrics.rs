@@ -31,23 +31,23 @@ const QUEUES: [&str; 3] = ["shards", "unacknowledged", "outbound"];
 
 impl ActorMetrics {
     pub(crate) fn new(m: &Metrics) -> Self {
+        let m = &m.of("actor");
         let metrics = Self {
-            shards: m.counters("magex_actor_shards_total", "Shards by outcome.", &["outcome"]),
-            joint_steps: m.counters("magex_actor_joint_steps_total", "Joint steps rolled out.", &["kind"]),
-            agent_steps: m.counters("magex_actor_agent_steps_total", "Agent steps rolled out.", &["kind"]),
-            rollout: m.seconds("magex_actor_rollout_seconds", "Rolling out a shard, waits excluded."),
-            goals_wait: m.seconds("magex_actor_goals_wait_seconds", "Waiting for the goals of a shard."),
-            weights_wait: m.seconds("magex_actor_weights_wait_seconds", "Waiting for the weights of a shard."),
-            upload: m
-                .seconds("magex_actor_upload_seconds", "From the result's encoding to the learner's acknowledgement."),
-            upload_bytes: m.counter("magex_actor_upload_bytes_total", "Bytes of results handed to the connection."),
-            weights_bytes: m.counter("magex_actor_weights_bytes_total", "Bytes of weights that arrived."),
-            weights_version: m.gauge("magex_actor_weights_version", "Newest version of the weights that arrived."),
-            connected: m.gauge("magex_actor_connected_state", "1 while a learner has accepted this actor, else 0."),
-            reconnects: m.counter("magex_actor_reconnects_total", "Connections to a learner after the first."),
-            threads: m.gauge("magex_actor_rollout_threads", "Rollout threads."),
-            busy: m.gauge("magex_actor_busy_threads", "Rollout threads with a shard."),
-            queue: m.gauges("magex_actor_queue_messages", "Messages that wait in the actor's queues.", &["queue"]),
+            shards: m.counters("shards_total", "Shards by outcome.", &["outcome"]),
+            joint_steps: m.counters("joint_steps_total", "Joint steps rolled out.", &["kind"]),
+            agent_steps: m.counters("agent_steps_total", "Agent steps rolled out.", &["kind"]),
+            rollout: m.seconds("rollout_seconds", "Rolling out a shard, waits excluded."),
+            goals_wait: m.seconds("goals_wait_seconds", "Waiting for the goals of a shard."),
+            weights_wait: m.seconds("weights_wait_seconds", "Waiting for the weights of a shard."),
+            upload: m.seconds("upload_seconds", "From the result's encoding to the learner's acknowledgement."),
+            upload_bytes: m.counter("upload_bytes_total", "Bytes of results handed to the connection."),
+            weights_bytes: m.counter("weights_bytes_total", "Bytes of weights that arrived."),
+            weights_version: m.gauge("weights_version", "Newest version of the weights that arrived."),
+            connected: m.gauge("connected_state", "1 while a learner has accepted this actor, else 0."),
+            reconnects: m.counter("reconnects_total", "Connections to a learner after the first."),
+            threads: m.gauge("rollout_threads", "Rollout threads."),
+            busy: m.gauge("busy_threads", "Rollout threads with a shard."),
+            queue: m.gauges("queue_messages", "Messages that wait in the actor's queues.", &["queue"]),
         };
         // A scrape shows all of them from the start.
         OUTCOMES.iter().for_each(|outcome| metrics.shards.with_label_values(&[outcome]).inc_by(0));

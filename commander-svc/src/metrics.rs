@@ -42,30 +42,20 @@ pub(crate) struct CommanderMetrics {
 impl CommanderMetrics {
     /// Declares them.
     pub(crate) fn new(m: &Metrics) -> Self {
+        let m = &m.of("commander");
         let metrics = Self {
-            calls: Calls::new(m, "commander", &METHODS),
-            answers: m.counters(
-                "magex_commander_answers_total",
-                "Teams and shards answered, by method.",
-                &["scheduler"],
-            ),
-            answer_seconds: m.seconds_by(
-                "magex_commander_answer_seconds",
-                "From a request to its answer, by method.",
-                &["scheduler"],
-            ),
-            fallbacks: m
-                .counter("magex_commander_fallbacks_total", "Answers by another method than the requested one."),
-            acted_agents: m.counter("magex_commander_policy_agents_total", "Agents whose actions a policy chose."),
-            act_seconds: m
-                .seconds("magex_commander_policy_seconds", "From a step of teams to the actions of its agents."),
-            in_flight: m.gauge("magex_commander_inflight_calls", "Calls in flight."),
-            streams: m.gauge("magex_commander_open_streams", "Open streams."),
-            missions: m.gauge("magex_commander_missions", "Missions of clients."),
-            weights_version: m
-                .gauge("magex_commander_weights_version", "Version of the newest usable model; -1 without one."),
-            free_processors: m.gauge("magex_commander_free_processors", "Processors free for large teams."),
-            backlog: m.gauge("magex_commander_queue_messages", "Events that the slowest watcher has not received."),
+            calls: Calls::new(m, &METHODS),
+            answers: m.counters("answers_total", "Teams and shards answered, by method.", &["scheduler"]),
+            answer_seconds: m.seconds_by("answer_seconds", "From a request to its answer, by method.", &["scheduler"]),
+            fallbacks: m.counter("fallbacks_total", "Answers by another method than the requested one."),
+            acted_agents: m.counter("policy_agents_total", "Agents whose actions a policy chose."),
+            act_seconds: m.seconds("policy_seconds", "From a step of teams to the actions of its agents."),
+            in_flight: m.gauge("inflight_calls", "Calls in flight."),
+            streams: m.gauge("open_streams", "Open streams."),
+            missions: m.gauge("missions", "Missions of clients."),
+            weights_version: m.gauge("weights_version", "Version of the newest usable model; -1 without one."),
+            free_processors: m.gauge("free_processors", "Processors free for large teams."),
+            backlog: m.gauge("queue_messages", "Events that the slowest watcher has not received."),
         };
         // Every method appears in a scrape from the start.
         for method in AssignmentMethod::ALL {

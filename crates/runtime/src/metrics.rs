@@ -11,7 +11,7 @@ use crate::sync::lock;
 use prometheus::core::Collector;
 use prometheus::{HistogramOpts, Opts, Registry, TextEncoder};
 use std::fmt;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 /// Upper bounds of the buckets of every duration histogram, seconds.
 const BUCKETS: [f64; 18] =
@@ -26,7 +26,9 @@ type Hook = Box<dyn Fn() + Send + Sync>;
 /// catalogue finds.
 pub struct Metrics {
     registry: Registry,
-    hooks: Mutex<Vec<Hook>>,
+    hooks: Arc<Mutex<Vec<Hook>>>,
+    /// What the names of the metrics begin with that are declared from here.
+    prefix: String,
 }
 
 impl fmt::Debug for Metrics {
@@ -44,39 +46,45 @@ impl Default for Metrics {
 impl Metrics {
     /// The metrics of the process itself (memory, processor time, open files); the service declares more.
     pub fn new() -> Self {
-        let metrics = Self { registry: Registry::new(), hooks: Mutex::default() };
+        let metrics = Self { registry: Registry::new(), hooks: Arc::default(), prefix: String::new() };
         process::declare(&metrics);
         metrics
     }
 
+    /// The same metrics, to declare those of a service: their names begin with `magex_<service>_`.
+    pub fn of(&self, service: &str) -> Self {
+        let (registry, hooks) = (self.registry.clone(), self.hooks.clone());
+        Self { registry, hooks, prefix: format!("magex_{service}_") }
+    }
+
     /// Declares a counter.
     pub fn counter(&self, name: &str, help: &str) -> IntCounter {
-        self.declare(IntCounter::new(name, help))
+        self.declare(IntCounter::new(self.name(name), help))
     }
 
     /// Declares a counter for every combination of labels.
     pub fn counters(&self, name: &str, help: &str, labels: &[&str]) -> IntCounterVec {
-        self.declare(IntCounterVec::new(Opts::new(name, help), labels))
+        self.declare(IntCounterVec::new(Opts::new(self.name(name), help), labels))
     }
 
     /// Declares a gauge.
     pub fn gauge(&self, name: &str, help: &str) -> Gauge {
-        self.declare(Gauge::new(name, help))
+        self.declare(Gauge::new(self.name(name), help))
     }
 
     /// Declares a gauge for every combination of labels.
     pub fn gauges(&self, name: &str, help: &str, labels: &[&str]) -> GaugeVec {
-        self.declare(GaugeVec::new(Opts::new(name, help), labels))
+        self.declare(GaugeVec::new(Opts::new(self.name(name), help), labels))
     }
 
     /// Declares a histogram of durations, in seconds.
     pub fn seconds(&self, name: &str, help: &str) -> Histogram {
-        self.declare(Histogram::with_opts(HistogramOpts::new(name, help).buckets(BUCKETS.to_vec())))
+        self.declare(Histogram::with_opts(HistogramOpts::new(self.name(name), help).buckets(BUCKETS.to_vec())))
     }
 
     /// Declares a histogram of durations, in seconds, for every combination of labels.
     pub fn seconds_by(&self, name: &str, help: &str, labels: &[&str]) -> HistogramVec {
-        self.declare(HistogramVec::new(HistogramOpts::new(name, help).buckets(BUCKETS.to_vec()), labels))
+        self.declare(HistogramVec::new(HistogramOpts::new(self.name(name), help).buckets(BUCKETS.to_vec()), labels))
     }
 
     /// Calls `hook` before every scrape, to set gauges that are computed on demand (ages, lengths of queues).
@@ -90,6 +98,10 @@ impl Metrics {
             hook();
         }
         TextEncoder::new().encode_to_string(&self.registry.gather()).unwrap_or_else(|error| format!("# {error}\n"))
+    }
+
+    fn name(&self, name: &str) -> String {
+        format!("{}{name}", self.prefix)
     }
 
     #[allow(

@@ -42,38 +42,26 @@ pub(crate) struct Series {
 /// Of the update: plot, title, unit, logarithmic or not, in curve.svg or not, and the series.
 type Update = (&'static str, &'static str, &'static str, bool, bool, &'static [(&'static str, &'static str, Kind)]);
 
+/// Series of the executor's update.
+macro_rules! series {
+    ($($name:literal $kind:ident),*) => { &[$(($name, concat!("executor/", $name), Kind::$kind)),*] };
+}
+
 const UPDATES: [Update; 11] = [
-    ("entropy", "Entropy", "nats per agent", false, true, &[("entropy", "executor/entropy", Kind::Actor)]),
-    ("policy", "Policy loss", "", false, true, &[("policy_loss", "executor/policy_loss", Kind::Actor)]),
-    ("value", "Value loss", "", true, true, &[("value_loss", "executor/value_loss", Kind::Critic)]),
-    ("td", "TD loss", "", true, true, &[("td_loss", "executor/td_loss", Kind::Critic)]),
-    (
-        "q_tot",
-        "Q_tot",
-        "mean of the joint actions taken",
-        false,
-        true,
-        &[("q_tot_mean", "executor/q_tot_mean", Kind::Critic)],
-    ),
-    ("epsilon", "ε", "share of random actions", false, true, &[("epsilon", "executor/epsilon", Kind::Actor)]),
-    (
-        "intrinsic",
-        "Intrinsic reward",
-        "per agent and step",
-        false,
-        true,
-        &[("intrinsic_reward", "executor/intrinsic_reward", Kind::Critic)],
-    ),
+    ("entropy", "Entropy", "nats per agent", false, true, series!("entropy" Actor)),
+    ("policy", "Policy loss", "", false, true, series!("policy_loss" Actor)),
+    ("value", "Value loss", "", true, true, series!("value_loss" Critic)),
+    ("td", "TD loss", "", true, true, series!("td_loss" Critic)),
+    ("q_tot", "Q_tot", "mean of the joint actions taken", false, true, series!("q_tot_mean" Critic)),
+    ("epsilon", "ε", "share of random actions", false, true, series!("epsilon" Actor)),
+    ("intrinsic", "Intrinsic reward", "per agent and step", false, true, series!("intrinsic_reward" Critic)),
     (
         "gradient",
         "Gradient norm",
         "before clipping",
         true,
         false,
-        &[
-            ("actor_grad_norm", "executor/actor_grad_norm", Kind::Actor),
-            ("critic_grad_norm", "executor/critic_grad_norm", Kind::Critic),
-        ],
+        series!("actor_grad_norm" Actor, "critic_grad_norm" Critic),
     ),
     (
         "q_gradient",
@@ -81,19 +69,9 @@ const UPDATES: [Update; 11] = [
         "before clipping",
         true,
         false,
-        &[
-            ("agent_grad_norm", "executor/agent_grad_norm", Kind::Actor),
-            ("mixer_grad_norm", "executor/mixer_grad_norm", Kind::Critic),
-        ],
+        series!("agent_grad_norm" Actor, "mixer_grad_norm" Critic),
     ),
-    (
-        "divergence",
-        "KL divergence",
-        "from the old policy",
-        false,
-        false,
-        &[("approx_kl", "executor/approx_kl", Kind::Actor)],
-    ),
+    ("divergence", "KL divergence", "from the old policy", false, false, series!("approx_kl" Actor)),
     ("commander", "Commander loss", "", false, false, &[("commander_loss", "commander/loss", Kind::Commander)]),
 ];
 

@@ -73,88 +73,67 @@ pub(crate) enum Rejection {
 
 impl LearnerMetrics {
     pub(crate) fn new(m: &Metrics) -> Self {
+        let m = &m.of("learner");
         let metrics = Self {
             shards: LeaseMetrics::new(m, "shards", "Shards"),
             episodes: LeaseMetrics::new(m, "episodes", "Episodes"),
             checks: m.counters(
-                "magex_learner_checks_total",
+                "checks_total",
                 "Shards computed a second time, by what the comparison gave.",
                 &["outcome"],
             ),
-            rejections: m.counters(
-                "magex_learner_rejections_total",
-                "Results rejected, by the check that did it.",
-                &["check"],
-            ),
-            oldest_lease: m.gauges(
-                "magex_learner_oldest_lease_seconds",
-                "Age of the oldest lease that an actor holds.",
-                &["actor"],
-            ),
+            rejections: m.counters("rejections_total", "Results rejected, by the check that did it.", &["check"]),
+            oldest_lease: m.gauges("oldest_lease_seconds", "Age of the oldest lease that an actor holds.", &["actor"]),
             hand_backs: m.gauges(
-                "magex_learner_hand_backs",
+                "hand_backs",
                 "Leases that an actor gave back in a row; from 2 on it is asked rarely.",
                 &["actor"],
             ),
             since_progress: m.gauge(
-                "magex_learner_since_progress_seconds",
+                "since_progress_seconds",
                 "Since the last result was accepted or the last iteration ended; 0 after the end of the run.",
             ),
-            rolled_back: m
-                .counter("magex_learner_roll_backs_total", "Returns to an earlier checkpoint after a conviction."),
-            received_bytes: m.counter("magex_learner_received_bytes_total", "Bytes of results received."),
-            joint_steps: m.counter("magex_learner_joint_steps_total", "Joint steps accepted into training batches."),
-            agent_steps: m.counter("magex_learner_agent_steps_total", "Agent steps accepted into training batches."),
-            actors_live: m.gauge("magex_learner_actors_live", "Actors connected."),
-            actors_expected: m
-                .gauge("magex_learner_actors_expected", "Actors connected, or missing for less than ten minutes."),
-            actor_threads: m.gauge("magex_learner_actor_threads", "Rollout threads of the actors connected."),
-            sessions_ended: m.counters(
-                "magex_learner_sessions_ended_total",
-                "Connections of actors that ended.",
-                &["reason"],
-            ),
-            queue: m.gauges("magex_learner_queue_messages", "Messages that wait in the learner's queues.", &["queue"]),
+            rolled_back: m.counter("roll_backs_total", "Returns to an earlier checkpoint after a conviction."),
+            received_bytes: m.counter("received_bytes_total", "Bytes of results received."),
+            joint_steps: m.counter("joint_steps_total", "Joint steps accepted into training batches."),
+            agent_steps: m.counter("agent_steps_total", "Agent steps accepted into training batches."),
+            actors_live: m.gauge("actors_live", "Actors connected."),
+            actors_expected: m.gauge("actors_expected", "Actors connected, or missing for less than ten minutes."),
+            actor_threads: m.gauge("actor_threads", "Rollout threads of the actors connected."),
+            sessions_ended: m.counters("sessions_ended_total", "Connections of actors that ended.", &["reason"]),
+            queue: m.gauges("queue_messages", "Messages that wait in the learner's queues.", &["queue"]),
             policy_lag: m.gauges(
-                "magex_learner_policy_lag_versions",
+                "policy_lag_versions",
                 "Newest version of the weights minus that of the samples of the latest batch.",
                 &["stat"],
             ),
             sample_age: m.gauges(
-                "magex_learner_sample_age_seconds",
+                "sample_age_seconds",
                 "Age of the samples of the latest batch, from their arrival to the update.",
                 &["stat"],
             ),
-            iterations: m.counter("magex_learner_iterations_total", "Iterations completed."),
-            phase: m.seconds_by("magex_learner_phase_seconds", "Wall time of the parts of an iteration.", &["phase"]),
+            iterations: m.counter("iterations_total", "Iterations completed."),
+            phase: m.seconds_by("phase_seconds", "Wall time of the parts of an iteration.", &["phase"]),
             bottleneck: m.counters(
-                "magex_learner_bottleneck_iterations_total",
+                "bottleneck_iterations_total",
                 "Iterations by the stage that took most of their time.",
                 &["stage"],
             ),
-            bottleneck_seconds: m.gauges(
-                "magex_learner_bottleneck_seconds",
-                "Seconds of the latest iteration by stage.",
-                &["stage"],
-            ),
-            weights_version: m.gauge("magex_learner_weights_version", "Newest version of the weights."),
-            weights_bytes: m.gauge("magex_learner_weights_bytes", "Size of the newest weights."),
+            bottleneck_seconds: m.gauges("bottleneck_seconds", "Seconds of the latest iteration by stage.", &["stage"]),
+            weights_version: m.gauge("weights_version", "Newest version of the weights."),
+            weights_bytes: m.gauge("weights_bytes", "Size of the newest weights."),
             weights_published: m.seconds(
-                "magex_learner_weights_published_seconds",
+                "weights_published_seconds",
                 "From publishing weights to handing them to a subscriber's connection.",
             ),
-            subscribers: m.gauges("magex_learner_subscribers", "Subscribers of the weights.", &["role"]),
-            checkpoint: m.seconds("magex_learner_checkpoint_seconds", "Writing a checkpoint."),
-            checkpoint_bytes: m.gauge("magex_learner_checkpoint_bytes", "Size of the latest checkpoint."),
-            checkpoint_failures: m
-                .counter("magex_learner_checkpoint_failures_total", "Checkpoints that could not be written."),
-            skipped: m.counter(
-                "magex_learner_skipped_updates_total",
-                "Minibatches skipped because a loss or a gradient was not finite.",
-            ),
-            success: m.gauge("magex_learner_success_ratio", "Success rate of the latest evaluation."),
-            reward: m
-                .gauge("magex_learner_reward_mean", "Mean reward per agent and step of the latest training episodes."),
+            subscribers: m.gauges("subscribers", "Subscribers of the weights.", &["role"]),
+            checkpoint: m.seconds("checkpoint_seconds", "Writing a checkpoint."),
+            checkpoint_bytes: m.gauge("checkpoint_bytes", "Size of the latest checkpoint."),
+            checkpoint_failures: m.counter("checkpoint_failures_total", "Checkpoints that could not be written."),
+            skipped: m
+                .counter("skipped_updates_total", "Minibatches skipped because a loss or a gradient was not finite."),
+            success: m.gauge("success_ratio", "Success rate of the latest evaluation."),
+            reward: m.gauge("reward_mean", "Mean reward per agent and step of the latest training episodes."),
         };
         // A scrape shows all of them from the start.
         ENDS.iter().for_each(|reason| metrics.sessions_ended.with_label_values(&[reason]).inc_by(0));
@@ -251,7 +230,7 @@ struct LeaseMetrics {
 
 impl LeaseMetrics {
     fn new(m: &Metrics, noun: &str, title: &str) -> Self {
-        let name = |what: &str| format!("magex_learner_{noun}_{what}");
+        let name = |what: &str| format!("{noun}_{what}");
         let counter = |what: &str, help: &str| m.counter(&name(&format!("{what}_total")), &format!("{title} {help}."));
         Self {
             counters: [

@@ -31,12 +31,6 @@ impl Gradient {
         Self { dw, db: vec![0.0; padded], k, n, transposed }
     }
 
-    /// Zero again.
-    pub(crate) fn clear(&mut self) {
-        self.dw.fill(0.0);
-        self.db.fill(0.0);
-    }
-
     /// Takes in some rows: x [rows, k] and dz [rows, n], in whole vectors (what stands beyond column n is of no account).
     pub(crate) fn add(&mut self, x: Rows<'_>, dz: Rows<'_>, rows: usize) {
         let (k, n, padded) = (self.k, self.n, self.db.len());

@@ -1,7 +1,7 @@
 mod gradients;
 
 use super::buffer::Buffer;
-use super::matmul::{Activation, Packed, Rows, Start, layer};
+use super::matmul::{Activation, PANEL, Packed, Rows, Start, layer};
 use super::operation::{Arg, Operation, apply3};
 use super::simd::{LANES, ln_of_normal, sum, transpose};
 use candle_core::{Result, Shape, Tensor, bail};
@@ -113,16 +113,11 @@ impl Op {
     /// Logits [A, padded] of A agents from i on towards all others, sixteen neighbours at a time. Several vectors at once
     /// hide the latency of the multiply-adds; each lane's sum has the same order either way.
     #[inline(always)]
-    fn row_logits<const A: usize>(&self, i: usize, score: &[f32], scratch: &Scratch, logits: [&mut [f32]; A]) {
-        let mut logits = logits;
-        let mut v = 0;
-        while v < scratch.padded {
-            if v + 4 * LANES <= scratch.padded {
-                self.logits_of::<A, 4>(i, v, score, scratch, &mut logits);
-                v += 4 * LANES;
-            } else {
-                self.logits_of::<A, 1>(i, v, score, scratch, &mut logits);
-                v += LANES;
+    fn row_logits<const A: usize>(&self, i: usize, score: &[f32], scratch: &Scratch, mut logits: [&mut [f32]; A]) {
+        for (v, four) in blocks(scratch.padded) {
+            match four {
+                true => self.logits_of::<A, 4>(i, v, score, scratch, &mut logits),
+                false => self.logits_of::<A, 1>(i, v, score, scratch, &mut logits),
             }
         }
     }
@@ -197,7 +192,7 @@ impl Op {
         let states = features.len() / (n * columns);
         // Grown row by row: a vector of zeros would be written twice.
         let mut y = Vec::with_capacity(states * n * width);
-        let (mut scratch, mut z) = (self.scratch(), Packed::room(n, width));
+        let (mut scratch, mut z) = (self.scratch(), Packed::zeros(n, width, PANEL));
         let padded = scratch.padded;
         let kept = if self.keep { states * n } else { TILE };
         let (mut logits, mut messages) = (Buffer::take(kept * padded), Buffer::take(kept * width));
@@ -241,6 +236,13 @@ impl Op {
         }
         y
     }
+}
+
+/// Where the blocks of a row of whole vectors begin, and whether they are of four vectors or of one.
+#[inline(always)]
+fn blocks(padded: usize) -> impl Iterator<Item = (usize, bool)> {
+    let fours = padded / (4 * LANES);
+    (0..fours).map(|b| (4 * LANES * b, true)).chain((4 * LANES * fours..padded).step_by(LANES).map(|v| (v, false)))
 }
 
 /// The first Q vectors.

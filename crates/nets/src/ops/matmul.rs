@@ -36,7 +36,7 @@ impl Activation {
 }
 
 /// Vectors of a panel, at most.
-const PANEL: usize = if WIDE { 4 } else { 1 };
+pub(crate) const PANEL: usize = if WIDE { 4 } else { 1 };
 
 /// Weights [k, n] cut into panels of up to [`PANEL`] vectors of columns, filled up with zeros.
 pub(crate) struct Packed {
@@ -48,29 +48,20 @@ pub(crate) struct Packed {
 impl Packed {
     /// From row-major [rows, columns].
     pub(crate) fn new(w: &[f32], rows: usize, columns: usize) -> Self {
-        Self::of(w, rows, columns, PANEL)
-    }
-
-    /// With panels of up to `most` vectors: one, two or four.
-    fn of(w: &[f32], rows: usize, columns: usize, most: usize) -> Self {
-        let mut packed = Self::zeros(rows, columns, most);
+        let mut packed = Self::zeros(rows, columns, PANEL);
         packed.fill(Rows::new(w, columns));
         packed
     }
 
     /// From the transpose of row-major [rows, columns]: a [columns, rows] matrix.
     pub(crate) fn transposed(w: &[f32], rows: usize, columns: usize) -> Self {
-        let mut packed = Self::room(columns, rows);
+        let mut packed = Self::zeros(columns, rows, PANEL);
         packed.fill_transposed(Rows::new(w, columns));
         packed
     }
 
-    /// Room for a [rows, columns] matrix, zero.
-    pub(crate) fn room(rows: usize, columns: usize) -> Self {
-        Self::zeros(rows, columns, PANEL)
-    }
-
-    fn zeros(rows: usize, columns: usize, most: usize) -> Self {
+    /// Room for a [rows, columns] matrix in panels of up to `most` vectors (one, two or four), zero.
+    pub(crate) fn zeros(rows: usize, columns: usize, most: usize) -> Self {
         let mut panels = Vec::new();
         let mut left = columns.div_ceil(LANES);
         while left > 0 {
@@ -374,7 +365,9 @@ mod tests {
         let (x, w, b) = (numbers(m * k, 1), numbers(k * n, 2), numbers(n, 3));
         let product = |most: usize| {
             let mut y = vec![0.0; m * n];
-            matmul(&x, &Packed::of(&w, k, n, most), Some(&b), Activation::Tanh, &mut y);
+            let mut packed = Packed::zeros(k, n, most);
+            packed.fill(Rows::new(&w, n));
+            matmul(&x, &packed, Some(&b), Activation::Tanh, &mut y);
             y
         };
         assert!(product(1) == product(4) && product(2) == product(4));

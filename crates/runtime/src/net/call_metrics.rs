@@ -15,15 +15,14 @@ pub struct Calls {
 }
 
 impl Calls {
-    /// Declares `magex_<component>_calls_total` and `magex_<component>_call_seconds`. Methods that are not among
-    /// `methods` are counted as `other`, so that a caller cannot create labels.
-    pub fn new(metrics: &Metrics, component: &str, methods: &'static [&'static str]) -> Self {
-        let name = |what: &str| format!("magex_{component}_{what}");
+    /// Declares `calls_total` and `call_seconds` of a service. Methods that are not among `methods` are counted as `other`, so
+    /// that a caller cannot create labels.
+    pub fn new(metrics: &Metrics, methods: &'static [&'static str]) -> Self {
         let total = "Calls by method and code; a stream counts when it opens.";
         let seconds = "From a call to its answer, by method; of a stream to its opening.";
         let calls = Self {
-            total: metrics.counters(&name("calls_total"), total, &["method", "code"]),
-            seconds: metrics.seconds_by(&name("call_seconds"), seconds, &["method"]),
+            total: metrics.counters("calls_total", total, &["method", "code"]),
+            seconds: metrics.seconds_by("call_seconds", seconds, &["method"]),
             methods,
         };
         // Every method appears in a scrape from the start.
@@ -60,7 +59,7 @@ mod tests {
     #[test]
     fn calls_are_counted_by_method_and_code() {
         let metrics = Metrics::new();
-        let calls = Calls::new(&metrics, "test", &["Ask"]);
+        let calls = Calls::new(&metrics.of("test"), &["Ask"]);
         for (code, path) in [(Code::Ok, "/s/Ask"), (Code::NotFound, "/s/Ask"), (Code::Unimplemented, "/s/Invented")] {
             let answer = match code {
                 Code::Ok => http::Response::new(Body::empty()),

@@ -1,8 +1,8 @@
 //! The way back through a graph block.
 
-use super::{Op, Saved, TILE, vectors};
+use super::{Op, Saved, TILE, blocks, vectors};
 use crate::ops::gradient::Gradient;
-use crate::ops::matmul::{Activation, Packed, Rows, Start, layer};
+use crate::ops::matmul::{Activation, PANEL, Packed, Rows, Start, layer};
 use crate::ops::simd::{self, LANES, WIDE, load, sigmoid, store, sum, transpose};
 use wide::f32x16;
 
@@ -22,12 +22,12 @@ impl Op {
         // Grown state by state: a vector of zeros would be written twice.
         let mut all_d_features = Vec::with_capacity(features.len());
         let (mut d_features, mut d_relative) = (vec![0.0; n * columns], vec![0.0; relative.len()]);
-        let (mut d_logits, mut z) = (vec![0.0; TILE * padded], Packed::room(width, n));
+        let (mut d_logits, mut z) = (vec![0.0; TILE * padded], Packed::zeros(width, n, PANEL));
         // Rows of a tile: gradients of their messages in whole vectors, and their edges.
         let stride = width.next_multiple_of(LANES);
         let (mut all_g, mut edges, mut d_z) =
             (vec![0.0; TILE * stride], vec![0.0; TILE * padded], vec![0.0; n * width]);
-        let (mut sums, mut through_edges) = (PairSums::new(p, padded), Gradient::new(n, width));
+        let mut sums = PairSums::new(p, padded);
         let (mut d_score, mut all) = (vec![0.0f32; p + 1], vec![0.0; p]);
         let (mut scaled, mut d_receiver) = (vec![0.0; p * padded], vec![0.0; padded * p]);
         for s in 0..states {
@@ -36,7 +36,7 @@ impl Op {
             self.load_pairs(features, &relative[s * n * p..(s + 1) * n * p], &mut scratch);
             z.fill_transposed(Rows::new(features, columns).skip(2 * p));
             sums.receiver.fill(f32x16::ZERO);
-            through_edges.clear();
+            let mut through_edges = Gradient::new(n, width);
             for first in (0..n).step_by(TILE) {
                 let rows = TILE.min(n - first);
                 for (at, i) in (first..first + rows).enumerate() {
@@ -98,7 +98,7 @@ impl Op {
             }
             for (j, d) in d_receiver.chunks_exact(p).take(n).enumerate() {
                 d_features[j * columns + p..][..p].copy_from_slice(d);
-                add(d, &mut d_relative[j * p..][..p]);
+                d_relative[j * p..][..p].iter_mut().zip(d).for_each(|(to, d)| *to += d);
             }
             all_d_features.extend_from_slice(&d_features);
         }
@@ -132,8 +132,7 @@ fn message_gradient((y, dy, message): (&[f32], &[f32], &[f32]), degree: usize, g
         (d, d * inverse)
     };
     let ((y, y_rest), (dy, dy_rest), (message, message_rest)) = (y.as_chunks(), dy.as_chunks(), message.as_chunks());
-    let (g, g_rest) = g.as_chunks_mut();
-    let (own, own_rest) = own.as_chunks_mut();
+    let ((g, g_rest), (own, own_rest)) = (g.as_chunks_mut(), own.as_chunks_mut());
     let mut own = own.iter_mut();
     for (((y, dy), message), g) in y.iter().zip(dy).zip(message).zip(g) {
         let (d, scaled) = part(f32x16::new(*y), f32x16::new(*dy), f32x16::new(*message));
@@ -148,14 +147,6 @@ fn message_gradient((y, dy, message): (&[f32], &[f32], &[f32]), degree: usize, g
         store(d, own_rest);
     }
     if degree == 0 { 0.0 } else { sum(through_mean) }
-}
-
-/// to += d.
-#[inline(always)]
-fn add(d: &[f32], to: &mut [f32]) {
-    for (d, to) in d.chunks(LANES).zip(to.chunks_mut(LANES)) {
-        store(load(to) + load(d), to);
-    }
 }
 
 /// Gradients of the pair network w2 · relu(u_i + v_j) + b2. Those of u and v lack the factor w2, which is the same for a whole sum.
@@ -179,14 +170,10 @@ impl PairSums {
     #[inline(always)]
     fn rows<const A: usize>(&mut self, sender: &[f32], receiver: &[f32], d_logits: &[f32], padded: usize) -> usize {
         self.sender.fill(f32x16::ZERO);
-        let mut v = 0;
-        while v < padded {
-            if v + 4 * LANES <= padded {
-                self.part::<A, 4>(sender, receiver, d_logits, v, padded);
-                v += 4 * LANES;
-            } else {
-                self.part::<A, 1>(sender, receiver, d_logits, v, padded);
-                v += LANES;
+        for (v, four) in blocks(padded) {
+            match four {
+                true => self.part::<A, 4>(sender, receiver, d_logits, v, padded),
+                false => self.part::<A, 1>(sender, receiver, d_logits, v, padded),
             }
         }
         A
