@@ -113,7 +113,7 @@ impl Op {
         for ((logits, d), others) in logits.as_chunks().0.iter().zip(d.as_chunks_mut().0).zip(self.others(i)) {
             let soft = sigmoid(f32x16::new(*logits) * inverse_temperature);
             let slope = soft * (f32x16::ONE - soft) * inverse_temperature;
-            let through = f32x16::new(*d) * slope & others;
+            let through = (f32x16::new(*d) * slope) & others;
             *b2 += through;
             *d = through.to_array();
         }
