@@ -18,8 +18,8 @@ NOT_EQUAL = {
     "ippo": "theirs: landmarks at random and episodes of 26 steps, no normalisation of values, one program compiled for "
     "these shapes (compilation not timed). Ours: ValueNorm, whole episodes of 25 steps, a run folder with metrics. "
     "Their observation also has two zeros per other agent (their communication channel).",
-    "local": "ours is another network of about the same size (k nearest neighbours pooled, goals by exact assignment); "
-    "theirs is the IPPO of the row above.",
+    "local": "ours is another network of about the same size (k nearest neighbours pooled), and the goal commander decides "
+    "and learns in its time; theirs is the IPPO of the row above, which has no commander.",
     "mappo-gru": "as for ippo. Theirs goes back through the whole rollout of 125 steps with memories cleared where episodes "
     "began, ours through chunks of a whole episode: the same gradients. Their critic reads [vector; state] row by row, "
     "ours multiplies the state once per joint state: the same function.",

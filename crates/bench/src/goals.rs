@@ -1,7 +1,6 @@
 //! `commander`, `ranking`: cost of the commanders' assignments over the exact cost, on unseen instances.
 
 use crate::report::Report;
-use anyhow::Context as _;
 use magex::folder;
 use magex::output::note;
 use magex::settings::{self, named};
@@ -12,7 +11,7 @@ use magex_core::ids::Mode;
 use magex_core::rng::{Key, Purpose};
 use magex_core::task::{Spawn, TaskConfig};
 use magex_env::spawn::{Start, spawn};
-use magex_learner::train::commander_ppo::{CommanderPpo, Sample, cost, greedy_cost};
+use magex_learner::train::commander_ppo::{CommanderPpo, Sample, cost};
 use magex_nets::commander::{Commander, Team};
 use serde_json::json;
 use std::path::PathBuf;
@@ -222,13 +221,13 @@ fn decisions(
             let start = instance(task, TRAIN, iteration * args.batch + k);
             let team = Team { agents: &start.agents, goals: &start.landmarks, dims: 2 };
             let instance = commander.instance(&team)?;
-            let scores = commander.scores(std::slice::from_ref(&instance))?.flatten_all()?.to_vec1::<f32>()?;
+            let scores = commander.scores(&[&instance])?.flatten_all()?.to_vec1::<f32>()?;
             let key = Key::new(args.seed, Purpose::Commander, &[iteration, k]);
-            let (decision, picks) = instance.decide(&scores, Some(&mut key.stream()));
+            let (decision, picks, log_probs) = instance.decide(&scores, Some(&mut key.stream()));
             let exact = exact_points(&start.agents, &start.landmarks, 2)?.1.max(1e-9);
-            let greedy = greedy_cost(commander, &instance, &team).context("greedy decision")?;
+            let greedy = cost(&team, &instance.decide(&scores, None).0.goals);
             let advantage = ((greedy - cost(&team, &decision.goals)) / exact) as f32;
-            Ok(Sample { instance, picks, advantage })
+            Ok(Sample { instance, picks, log_probs, advantage })
         })
         .collect()
 }

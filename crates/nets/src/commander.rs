@@ -15,7 +15,7 @@ mod ranking;
 
 use crate::ops::{Pick, PickTable, pick_log_probs};
 use crate::params::{Entry, ParamBuilder, ParamError, Params};
-use candle_core::Tensor;
+use candle_core::{Result as CandleResult, Tensor};
 use magex_assign::random::random;
 use magex_assign::{AssignError, BottleneckSolver, Solver, Switching, distance, exact_points, greedy, powered};
 use magex_core::config::{CommanderConfig, CommanderPolicy};
@@ -167,7 +167,7 @@ impl Commander {
         match (&self.net, self.kind) {
             (Some(_), _) => {
                 let instance = self.instance(team)?;
-                let scores = self.scores(std::slice::from_ref(&instance))?.flatten_all()?.to_vec1::<f32>()?;
+                let scores = self.scores(&[&instance])?.flatten_all()?.to_vec1::<f32>()?;
                 let stream = (mode == Mode::Sampled).then_some(stream);
                 Ok(instance.decide(&scores, stream).0)
             }
@@ -192,7 +192,7 @@ impl Commander {
     }
 
     /// Flat scores of several instances, one score matrix after the other.
-    pub fn scores(&self, instances: &[Instance]) -> Result<Tensor, CommanderError> {
+    pub fn scores(&self, instances: &[&Instance]) -> Result<Tensor, CommanderError> {
         match &self.net {
             Some(Net::Pairwise(net)) => Ok(net.forward(instances)?),
             Some(Net::Ranking(net)) => Ok(net.forward(instances)?),
@@ -201,14 +201,19 @@ impl Commander {
     }
 
     /// [2, P] log-probabilities and entropies of all picks of given decisions, differentiable in the network's weights.
-    pub fn pick_log_probs(&self, instances: &[Instance], picks: &[Vec<Pick>]) -> Result<Tensor, CommanderError> {
+    pub fn pick_log_probs(&self, instances: &[&Instance], picks: &[&[Pick]]) -> Result<Tensor, CommanderError> {
+        Ok(Self::log_probs_of(&self.scores(instances)?, instances, picks)?)
+    }
+
+    /// The same, given the [`Self::scores`].
+    pub fn log_probs_of(scores: &Tensor, instances: &[&Instance], picks: &[&[Pick]]) -> CandleResult<Tensor> {
         let mut end = 0;
         let tables = instances.iter().zip(picks).map(|(instance, picks)| {
             let start = end;
             end += instance.cells();
-            PickTable { start, columns: instance.columns, picks: picks.clone() }
+            PickTable { start, columns: instance.columns, picks: picks.to_vec() }
         });
-        Ok(pick_log_probs(&self.scores(instances)?, Arc::new(tables.collect()))?)
+        pick_log_probs(scores, Arc::new(tables.collect()))
     }
 }
 

@@ -27,7 +27,6 @@ use magex_core::trajectory::Trajectory;
 use magex_nets::commander::{Commander, CommanderError, Instance, Team};
 use magex_nets::ops::{self, Pick};
 use magex_nets::params::{ParamBuilder, ParamError};
-use std::slice::from_ref;
 
 pub use imitation::Lesson;
 
@@ -41,6 +40,8 @@ pub struct Sample {
     pub instance: Instance,
     /// What was decided, in the order of the picks.
     pub picks: Vec<Pick>,
+    /// Log-probability of each pick when it was decided.
+    pub log_probs: Vec<f32>,
     /// R_c of the decision minus R_c of the greedy decision; or the measured reward minus its forecast.
     pub advantage: f32,
 }
@@ -102,11 +103,9 @@ impl CommanderPpo {
             return Ok(CommanderStats::default());
         }
         let commander = self.commander(network)?;
-        let mut samples = Vec::new();
-        let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
         // Of every episode: what was measured, and what was known of its instances before the decisions.
         let (mut rewards, mut known) = (Vec::new(), Vec::<Vec<f64>>::new());
-        let mut episode_of_sample = Vec::new();
+        let mut decided = Vec::new();
         for (trajectory, t) in trajectories.iter().enumerate() {
             let (stages, points) = (self.stages.len(), (&*t.positions, t.statics.get(LANDMARKS)));
             for b in 0..t.shape.episodes {
@@ -126,31 +125,47 @@ impl CommanderPpo {
                     let picks = stage_goals(t, b, k).and_then(|goals| instance.picks_of(&goals)).ok_or_else(|| {
                         CommanderError::Instance(format!("the goals of stage {k} of episode {b} are not one-to-one"))
                     })?;
-                    let at = b * stages + k;
-                    let greedy_goals = greedy_goals(&commander, &instance)?;
-                    let greedy = cost(&team, &greedy_goals);
-                    if let Some(known) = known.last_mut() {
-                        known.extend([greedy, arrival::longest(&team, &greedy_goals)]);
-                    }
-                    let exact = f64::from(t.exact_costs[at]).max(1e-9);
-                    let advantage = (greedy - f64::from(t.costs[at])) / exact;
-                    if !(advantage as f32).is_finite() {
-                        // It would spoil the scale of all others.
-                        skipped += 1.0;
-                        continue;
-                    }
-                    ratio_sum += greedy / exact;
-                    let log_probs = commander.pick_log_probs(from_ref(&instance), from_ref(&picks))?;
-                    let total = log_probs.get(0)?.sum_all()?.to_scalar::<f32>()?;
-                    let difference = f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64;
-                    if difference.is_nan() || difference > LOG_PROB_TOLERANCE {
-                        let (field, limit) = ("goal_log_probs", LOG_PROB_TOLERANCE);
-                        return Err(Suspect { trajectory, field, error: difference, limit }.into());
-                    }
-                    error = error.max(difference);
-                    episode_of_sample.push(rewards.len() - 1);
-                    samples.push(Sample { instance, picks, advantage: advantage as f32 });
+                    decided.push(((instance, picks), team, (trajectory, b * stages + k, rewards.len() - 1)));
                 }
+            }
+        }
+        let (mut samples, mut episode_of_sample) = (Vec::new(), Vec::new());
+        let (mut ratio_sum, mut error, mut skipped) = (0.0, 0.0f64, 0.0);
+        let mut decided = decided.into_iter().peekable();
+        // Many at a time: one alone is not worth a pass of the network.
+        while decided.peek().is_some() {
+            let group: Vec<_> = decided.by_ref().take(self.config.minibatch).collect();
+            let (instances, picks): (Vec<&Instance>, Vec<&[Pick]>) =
+                group.iter().map(|((instance, picks), ..)| (instance, &**picks)).unzip();
+            let scores = commander.scores(&instances)?;
+            let log_probs = Commander::log_probs_of(&scores, &instances, &picks)?.get(0)?.to_vec1::<f32>()?;
+            let (scores, mut log_probs) = (scores.flatten_all()?.to_vec1::<f32>()?, log_probs.into_iter());
+            let mut rest = &scores[..];
+            for ((instance, picks), team, (trajectory, at, episode)) in group {
+                let (own, others) = rest.split_at(instance.cells());
+                rest = others;
+                let log_probs: Vec<f32> = log_probs.by_ref().take(picks.len()).collect();
+                let (t, goals) = (&trajectories[trajectory], instance.decide(own, None).0.goals);
+                let greedy = cost(&team, &goals);
+                known[episode].extend([greedy, arrival::longest(&team, &goals)]);
+                let exact = f64::from(t.exact_costs[at]).max(1e-9);
+                let advantage = ((greedy - f64::from(t.costs[at])) / exact) as f32;
+                if !advantage.is_finite() {
+                    // It would spoil the scale of all others.
+                    skipped += 1.0;
+                    continue;
+                }
+                ratio_sum += greedy / exact;
+                // In the commander's order.
+                let total = log_probs.iter().sum::<f32>();
+                let difference = f64::from((total - t.goal_log_probs[at]).abs()) / picks.len().max(1) as f64;
+                if difference.is_nan() || difference > LOG_PROB_TOLERANCE {
+                    let (field, limit) = ("goal_log_probs", LOG_PROB_TOLERANCE);
+                    return Err(Suspect { trajectory, field, error: difference, limit }.into());
+                }
+                error = error.max(difference);
+                episode_of_sample.push(episode);
+                samples.push(Sample { instance, picks, log_probs, advantage });
             }
         }
         if self.config.objective == CommanderObjective::Arrival {
@@ -184,7 +199,6 @@ impl CommanderPpo {
         // Scaled, not centred: the self-critical baseline already is the centre.
         let square = samples.iter().map(|s| f64::from(s.advantage).powi(2)).sum::<f64>() / samples.len().max(1) as f64;
         let scale = (1.0 / (square.sqrt() + 1e-6)) as f32;
-        let old = self.log_probs_of(network, samples)?;
         let mut stats = CommanderStats::default();
         let mut count = 0.0;
         for epoch in 0..c.epochs {
@@ -192,11 +206,11 @@ impl CommanderPpo {
             Key::new(self.seed, Purpose::Shuffle, &[iteration, epoch as u32, 1]).stream().shuffle(&mut order);
             for minibatch in order.chunks(c.minibatch) {
                 let (commander, variables) = self.differentiable(network)?;
-                let instances: Vec<Instance> = minibatch.iter().map(|&i| samples[i].instance.clone()).collect();
-                let picks: Vec<Vec<Pick>> = minibatch.iter().map(|&i| samples[i].picks.clone()).collect();
+                let instances: Vec<&Instance> = minibatch.iter().map(|&i| &samples[i].instance).collect();
+                let picks: Vec<&[Pick]> = minibatch.iter().map(|&i| &*samples[i].picks).collect();
                 let now = commander.pick_log_probs(&instances, &picks)?;
                 let rows = now.dim(1)?;
-                let old: Vec<f32> = minibatch.iter().flat_map(|&i| old[i].iter().copied()).collect();
+                let old: Vec<f32> = minibatch.iter().flat_map(|&i| samples[i].log_probs.iter().copied()).collect();
                 let advantage: Vec<f32> = minibatch
                     .iter()
                     .flat_map(|&i| std::iter::repeat_n(samples[i].advantage * scale, samples[i].picks.len()))
@@ -246,16 +260,6 @@ impl CommanderPpo {
         let (rate, max_norm) = (c.learning_rate * rate_factor, c.max_grad_norm.into());
         Ok(network.moments.adam_step(&mut network.params.values, &gradient, rate, 1e-5, max_norm))
     }
-
-    /// Log-probabilities of every pick under the present weights.
-    fn log_probs_of(&self, network: &Network, samples: &[Sample]) -> Result<Vec<Vec<f32>>, CommanderError> {
-        let commander = self.commander(network)?;
-        let of = |s: &Sample| {
-            let both = commander.pick_log_probs(from_ref(&s.instance), from_ref(&s.picks))?;
-            Ok(both.get(0)?.to_vec1::<f32>()?)
-        };
-        samples.iter().map(of).collect()
-    }
 }
 
 /// The k-th stage's assignment of an episode, `[N]`, out of the agents' chains of goals; `None` if it is not one-to-one.
@@ -271,17 +275,6 @@ pub(crate) fn stage_goals(t: &Trajectory, episode: usize, k: usize) -> Option<Ve
         *slot = chain[k];
     }
     Some(goals)
-}
-
-/// The most likely decision.
-fn greedy_goals(commander: &Commander, instance: &Instance) -> Result<Vec<u32>, CommanderError> {
-    let scores = commander.scores(from_ref(instance))?.flatten_all()?.to_vec1::<f32>()?;
-    Ok(instance.decide(&scores, None).0.goals)
-}
-
-/// C of the most likely decision.
-pub fn greedy_cost(commander: &Commander, instance: &Instance, team: &Team<'_>) -> Result<f64, CommanderError> {
-    Ok(cost(team, &greedy_goals(commander, instance)?))
 }
 
 /// C: summed distance of an assignment, in double precision; agents without a goal cost nothing.

@@ -73,7 +73,7 @@ pub(crate) fn scheduler(kind: CommanderPolicy, agents: usize) -> Commander {
 
 pub(crate) fn scores(commander: &Commander, team: &Team<'_>) -> Vec<f32> {
     let instance = commander.instance(team).unwrap();
-    commander.scores(&[instance]).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+    commander.scores(&[&instance]).unwrap().flatten_all().unwrap().to_vec1().unwrap()
 }
 
 pub(crate) fn stream(k: u32) -> Stream {

@@ -18,7 +18,7 @@ use magex_core::rng::{Key, Purpose, Stream};
 use magex_core::sha256;
 use magex_core::task::Spawn;
 use magex_learner::run_folder::FolderError;
-use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost, greedy_cost};
+use magex_learner::train::commander_ppo::{CommanderPpo, Lesson, Sample, cost};
 use magex_learner::train::learned::Network;
 use magex_nets::weights_file;
 use magex_runtime::options;
@@ -205,13 +205,13 @@ impl Training {
             let synthetic = Synthetic::draw(&mut self.stream(REWARD, step, k));
             let team = synthetic.team();
             let instance = commander.instance(&team)?;
-            let scores = commander.scores(std::slice::from_ref(&instance))?.flatten_all()?.to_vec1::<f32>()?;
+            let scores = commander.scores(&[&instance])?.flatten_all()?.to_vec1::<f32>()?;
             let mut stream = Key::new(self.config.run.seed, Purpose::Commander, &[step, k]).stream();
-            let (decision, picks) = instance.decide(&scores, Some(&mut stream));
+            let (decision, picks, log_probs) = instance.decide(&scores, Some(&mut stream));
             let exact = exact_points(team.agents, team.goals, 2)?.1.max(1e-9);
-            let greedy = greedy_cost(&commander, &instance, &team)?;
+            let greedy = cost(&team, &instance.decide(&scores, None).0.goals);
             let advantage = ((greedy - cost(&team, &decision.goals)) / exact) as f32;
-            Ok(Sample { instance, picks, advantage })
+            Ok(Sample { instance, picks, log_probs, advantage })
         })?;
         let stats = self.ppo.improve(network, &samples, step, rate)?;
         Ok((stats.loss, stats.entropy))

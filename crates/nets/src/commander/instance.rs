@@ -37,12 +37,14 @@ pub(super) enum PickOrder {
 }
 
 impl Instance {
-    pub(super) fn cells(&self) -> usize {
+    /// Numbers of its score matrix.
+    pub fn cells(&self) -> usize {
         self.rows * self.columns
     }
 
-    /// Picks in turn: the best free column, or a sample. Returns the decision and its picks.
-    pub fn decide(&self, scores: &[f32], mut stream: Option<&mut Stream>) -> (Decision, Vec<Pick>) {
+    /// Picks in turn: the best free column, or a sample. Returns the decision, its picks, and the log-probability of each.
+    pub fn decide(&self, scores: &[f32], mut stream: Option<&mut Stream>) -> (Decision, Vec<Pick>, Vec<f32>) {
+        let mut log_probs = Vec::with_capacity(self.rows);
         let mut decision =
             Decision { goals: vec![u32::MAX; self.agents], log_prob: 0.0, probabilities: vec![0.0; self.agents] };
         let picks = self.pick_in_turn(|row, picker, mask| {
@@ -67,6 +69,7 @@ impl Instance {
             };
             let log_prob = softmax.log_prob(scores[column]);
             decision.log_prob += log_prob;
+            log_probs.push(log_prob);
             let target = self.column_of[column];
             let (agent, goal) = if self.swapped { (target, picker) } else { (picker, target) };
             decision.goals[agent as usize] = goal;
@@ -74,7 +77,7 @@ impl Instance {
             Some(column)
         });
         // Every turn finds a column: there are at least as many columns as turns.
-        (decision, picks.unwrap_or_default())
+        (decision, picks.unwrap_or_default(), log_probs)
     }
 
     /// The picks that lead to a given decision (`[N]` goals), in the order of the turns; `None` if it is not one-to-one.

@@ -40,8 +40,8 @@ impl PairwiseNet {
         })
     }
 
-    pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
-        let cells = instances.iter().map(Instance::cells).sum();
+    pub(super) fn forward(&self, instances: &[&Instance]) -> CandleResult<Tensor> {
+        let cells = instances.iter().map(|instance| instance.cells()).sum();
         let mut reduced_costs = Vec::with_capacity(cells);
         let (mut features, mut places) = (Vec::new(), Vec::new());
         for instance in instances {

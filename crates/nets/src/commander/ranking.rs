@@ -48,7 +48,7 @@ impl RankingNet {
     }
 
     /// [B·N] scores of B instances.
-    pub(super) fn forward(&self, instances: &[Instance]) -> CandleResult<Tensor> {
+    pub(super) fn forward(&self, instances: &[&Instance]) -> CandleResult<Tensor> {
         let features: Vec<f32> = instances.iter().flat_map(|instance| instance.features.iter().copied()).collect();
         let x = constant(features, 2 * self.dims * self.agents)?;
         let hidden = self.layers[1].forward(&self.layers[0].forward(&x)?)?;

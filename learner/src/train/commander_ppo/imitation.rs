@@ -38,10 +38,10 @@ impl CommanderPpo {
     /// Lessons of another scheduler, and what the tensor library refuses.
     pub fn imitate(&self, network: &mut Network, lessons: &[Lesson], rate: f64) -> Result<f64, CommanderError> {
         let (commander, variables) = self.differentiable(network)?;
-        let instances: Vec<Instance> = lessons.iter().map(|lesson| lesson.instance.clone()).collect();
-        let picks: Vec<Vec<Pick>> = lessons.iter().map(|lesson| lesson.picks.clone()).collect();
+        let instances: Vec<&Instance> = lessons.iter().map(|lesson| &lesson.instance).collect();
+        let picks: Vec<&[Pick]> = lessons.iter().map(|lesson| &*lesson.picks).collect();
         let log_probs = commander.pick_log_probs(&instances, &picks)?.get(0)?;
-        let share = |picks: &Vec<Pick>| std::iter::repeat_n(1.0 / (picks.len() * lessons.len()) as f32, picks.len());
+        let share = |picks: &&[Pick]| std::iter::repeat_n(1.0 / (picks.len() * lessons.len()) as f32, picks.len());
         let weights: Vec<f32> = picks.iter().flat_map(share).collect();
         let loss = (log_probs * column(weights)?)?.sum_all()?.neg()?;
         self.descend(network, &variables, &loss, rate)?;

@@ -33,9 +33,7 @@ fn lessons(ppo: &CommanderPpo, sizes: &[(usize, usize)]) -> Vec<Lesson> {
 fn mean_log_prob(ppo: &CommanderPpo, network: &Network, lessons: &[Lesson]) -> f64 {
     let commander = ppo.commander(network).unwrap();
     let of = |lesson: &Lesson| {
-        let both = commander
-            .pick_log_probs(std::slice::from_ref(&lesson.instance), std::slice::from_ref(&lesson.picks))
-            .unwrap();
+        let both = commander.pick_log_probs(&[&lesson.instance], &[&lesson.picks]).unwrap();
         f64::from(both.get(0).unwrap().mean_all().unwrap().to_scalar::<f32>().unwrap())
     };
     lessons.iter().map(of).sum::<f64>() / lessons.len() as f64
@@ -53,7 +51,7 @@ fn a_sampled_decision_has_the_same_likelihood_when_it_is_looked_at_again() {
         let instance = commander.instance(&team).unwrap();
         let picks = instance.picks_of(&decision.goals).unwrap();
         assert_eq!(picks.len(), n.min(g));
-        let both = commander.pick_log_probs(&[instance], std::slice::from_ref(&picks)).unwrap();
+        let both = commander.pick_log_probs(&[&instance], &[&picks]).unwrap();
         let again = both.get(0).unwrap().to_vec1::<f32>().unwrap();
         // Bit for bit: the first importance ratio is exactly 1.
         assert_eq!(again.iter().sum::<f32>(), decision.log_prob, "{n} agents, {g} goals");
@@ -92,8 +90,8 @@ fn the_gradient_of_the_cross_entropy_is_its_slope() {
     let mut stream = Key::new(9, Purpose::Init, &[]).stream();
     network.params.values.iter_mut().for_each(|x| *x += 0.1 * stream.normal() as f32);
     let (commander, variables) = ppo.differentiable(&network).unwrap();
-    let instances: Vec<Instance> = lessons.iter().map(|l| l.instance.clone()).collect();
-    let picks: Vec<Vec<Pick>> = lessons.iter().map(|l| l.picks.clone()).collect();
+    let instances: Vec<&Instance> = lessons.iter().map(|l| &l.instance).collect();
+    let picks: Vec<&[Pick]> = lessons.iter().map(|l| &*l.picks).collect();
     let both = commander.pick_log_probs(&instances, &picks).unwrap();
     let value =
         |both: &Tensor| both.get(0).unwrap().sum_all().unwrap() + (both.get(1).unwrap().sum_all().unwrap() * 0.3);
