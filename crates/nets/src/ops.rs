@@ -42,7 +42,7 @@ pub(crate) use norm::layer_norm_in_place;
 pub use pairs::{maximum, minimum, minus, plus, row, times};
 pub(crate) use picks::{Mask, MaskedSoftmax};
 pub use picks::{Pick, PickTable, pick_log_probs};
-pub use pool::mean_of_others;
+pub use pool::with_mean_of_others;
 pub use recurrent::{Before, recurrent};
 pub(crate) use simd::{LANES, exp_of_negative, load};
 

@@ -3,7 +3,9 @@
 use super::memory::Memory;
 use super::{Input, Layer, Network, Output, RELU_GAIN};
 use crate::features::FeatureSpec;
-use crate::ops::{Activation, Chain, ChainBuilder, GraphBlock, constant, graph_block, linear, mean_of_others, softmax};
+use crate::ops::{
+    Activation, Chain, ChainBuilder, GraphBlock, constant, graph_block, linear, softmax, with_mean_of_others,
+};
 use crate::params::{Init, ParamBuilder, ParamError};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::Module;
@@ -143,14 +145,12 @@ impl TeamNet {
         let x = self.observe.forward(None, features)?;
         match &self.team {
             Team::Graph { blocks, literal } => {
-                let others = mean_of_others(&x, n)?;
-                let mut h = if *literal {
+                let mut h = with_mean_of_others(&x, n)?;
+                if *literal {
                     // Mean over all agents, the agent itself included: every node gets the same feature.
                     let share = 1.0 / n as f64;
-                    ((&x * share)? + (others * (1.0 - share))?)?
-                } else {
-                    Tensor::cat(&[&x, &others], 1)?
-                };
+                    h = ((&x * share)? + (h.narrow(1, self.width, self.width)? * (1.0 - share))?)?;
+                }
                 let pairs = constant(features.pairs.as_slice(), 2 * self.spec.shape.dims)?;
                 let zeros = Tensor::zeros(self.pair_hidden, DType::F32, &Device::Cpu)?;
                 for block in blocks {

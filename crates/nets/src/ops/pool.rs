@@ -3,52 +3,51 @@ use super::simd::{LANES, WIDE, load, store};
 use candle_core::{Result, Shape, Tensor, bail};
 use wide::f32x16;
 
-/// For every agent the mean of the *other* agents' rows: [S·N, F] → [S·N, F], N rows per joint state. This is the fully
-/// connected GCN of the paper (eq. 6) with degree normalisation and without the self term, which the caller keeps apart.
-pub fn mean_of_others(x: &Tensor, agents: usize) -> Result<Tensor> {
-    apply1(MeanOfOthers { agents }, x)
+/// Every agent's row beside the mean of the *other* agents' rows: [S·N, F] → [S·N, 2F], N rows per joint state. The second half is
+/// the fully connected GCN of the paper (eq. 6) with degree normalisation and without the self term, which is the first half.
+pub fn with_mean_of_others(x: &Tensor, agents: usize) -> Result<Tensor> {
+    apply1(WithMeanOfOthers { agents }, x)
 }
 
-struct MeanOfOthers {
+struct WithMeanOfOthers {
     agents: usize,
 }
 
-impl MeanOfOthers {
-    /// The map is symmetric, so its gradient is itself.
-    fn run(&self, x: &[f32], width: usize) -> Vec<f32> {
-        let mut y = vec![0.0; x.len()];
-        let scale = 1.0 / (self.agents.max(2) - 1) as f32;
-        let mut total = vec![0.0; width];
-        for (x, y) in x.chunks_exact(self.agents * width).zip(y.chunks_exact_mut(self.agents * width)) {
-            total.fill(0.0);
-            for row in x.chunks_exact(width) {
-                for (t, v) in total.iter_mut().zip(row) {
-                    *t += v;
-                }
-            }
-            for (row, out) in x.chunks_exact(width).zip(y.chunks_exact_mut(width)) {
-                for i in 0..width {
-                    out[i] = (total[i] - row[i]) * scale;
-                }
-            }
-        }
-        y
-    }
+/// Σ of the rows, in their order.
+fn sum_rows<'a>(rows: impl Iterator<Item = &'a [f32]>, total: &mut [f32]) {
+    total.fill(0.0);
+    rows.for_each(|row| total.iter_mut().zip(row).for_each(|(t, v)| *t += v));
 }
 
-impl Operation<1> for MeanOfOthers {
-    const NAME: &'static str = "mean-of-others";
+impl Operation<1> for WithMeanOfOthers {
+    const NAME: &'static str = "with-mean-of-others";
 
     fn forward(&self, [x]: [Arg<'_>; 1]) -> Result<(Vec<f32>, Shape)> {
-        let (rows, width) = x.rows();
+        let ((rows, width), scale) = (x.rows(), 1.0 / (self.agents.max(2) - 1) as f32);
         if self.agents == 0 || rows % self.agents != 0 {
             bail!("mean of others: {rows} rows are not a multiple of {} agents", self.agents);
         }
-        Ok((self.run(x.values, width), Shape::from(x.dims)))
+        let (mut y, mut total) = (Vec::with_capacity(2 * x.values.len()), vec![0.0; width]);
+        for state in x.values.chunks_exact(self.agents * width) {
+            sum_rows(state.chunks_exact(width), &mut total);
+            for row in state.chunks_exact(width) {
+                y.extend_from_slice(row);
+                y.extend(total.iter().zip(row).map(|(t, v)| (t - v) * scale));
+            }
+        }
+        Ok((y, Shape::from((rows, 2 * width))))
     }
 
     fn backward(&self, [x]: [Arg<'_>; 1], _y: &[f32], dy: &[f32]) -> Result<[Option<Vec<f32>>; 1]> {
-        Ok([Some(self.run(dy, x.rows().1))])
+        let (width, scale) = (x.rows().1, 1.0 / (self.agents.max(2) - 1) as f32);
+        let (mut dx, mut total) = (Vec::with_capacity(x.values.len()), vec![0.0; width]);
+        for state in dy.chunks_exact(2 * self.agents * width) {
+            sum_rows(state.chunks_exact(2 * width).map(|row| &row[width..]), &mut total);
+            for (own, others) in state.chunks_exact(2 * width).map(|row| row.split_at(width)) {
+                dx.extend(own.iter().zip(others).zip(&total).map(|((own, d), t)| own + (t - d) * scale));
+            }
+        }
+        Ok([Some(dx)])
     }
 }
 

@@ -50,7 +50,7 @@ fn linear_and_norm() {
     }
     let (scale, shift) = (var(&[5], 4), var(&[5], 5));
     check(&[&x, &scale, &shift], &|| ops::layer_norm(&x, &scale, &shift).unwrap());
-    check(&[&x], &|| ops::mean_of_others(&x, 3).unwrap());
+    check(&[&x], &|| ops::with_mean_of_others(&x, 3).unwrap());
 }
 
 #[test]
